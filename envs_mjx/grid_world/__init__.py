@@ -1,0 +1,6 @@
+"""Grid World: navigation with five-move skills past a lava river (spec grid_world)."""
+
+from envs_mjx.grid_world.environment import GridWorld, GridWorldParams, GridWorldState
+from envs_mjx.grid_world.skills import skill_universe
+
+__all__ = ["GridWorld", "GridWorldParams", "GridWorldState", "skill_universe"]

@@ -1,0 +1,1 @@
+"""Command lines: every module here is run as `python -m experiments.NAME`."""

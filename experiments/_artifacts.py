@@ -1,0 +1,231 @@
+"""What stages hand to each other: recordings, encoders, tables. Made on demand, said beforehand."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._flags import UsageError, budget_of
+from jaxnew import config as config_lib
+from jaxnew import loop, observations
+from jaxnew.actions import ActionSplit, ActionUniverse
+from jaxnew.checkpoint import Checkpointer
+from jaxnew.observations import ActionObservations
+from jaxnew.representation.learner import (
+    Modality,
+    RepresentationConfig,
+    RepresentationLearner,
+    RepresentationState,
+)
+from jaxnew.representation.table import RepresentationTable, engineered_table
+from jaxnew.run_directory import RunDirectory
+from jaxnew.task import Play, StageOneBudget, Task
+
+# One encoder is shared by all policy seeds, as in the paper (spec method 1); so are the recordings.
+REPRESENTATION_SEED = 31
+TABLE_FILE = "table.npz"
+SPLIT_FILE = "split.json"
+
+
+@dataclass(frozen=True)
+class Domain:
+    """A task with its universe and one of its splits."""
+
+    task: Task
+    universe: ActionUniverse
+    split_name: str
+    split: ActionSplit
+
+    @classmethod
+    def of(cls, task: Task, split_name: str | None) -> Domain:
+        universe = task.make_universe()
+        name = split_name or task.default_split
+        return cls(task, universe, name, task.make_split(name, universe))
+
+    def folder(self, runs: Path) -> Path:
+        """Where this task's runs are kept."""
+        return runs / self.task.name
+
+    @property
+    def play(self) -> Play:
+        """The play environment.
+
+        Raises:
+          UsageError: the task has none; its representations are given.
+        """
+        if self.task.play is None:
+            raise UsageError(f"Task {self.task.name} has no play environment to record actions in.")
+        return self.task.play
+
+
+@dataclass(frozen=True)
+class EmbedConfig:
+    """All that fixes a stage-one run."""
+
+    task: str
+    representation: str
+    split: str
+    split_hash: str
+    observations_hash: str
+    seed: int
+    train_on: str
+    model: RepresentationConfig
+
+
+def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
+    """Kind and modality of a learned representation's name, such as `hvae` or `vae-onehot`.
+
+    Raises:
+      UsageError: the name is not of that form.
+    """
+    kind, _, modality_name = name.partition("-")
+    modalities = domain.play.modalities
+    modality_name = modality_name or next(iter(modalities))
+    if kind not in ("hvae", "vae") or modality_name not in modalities:
+        legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in modalities]
+        raise UsageError(
+            f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}; engineered: "
+            f"{', '.join(domain.universe.engineered)}; or a run directory of embed, or an .npz file."
+        )
+    return kind, modalities[modality_name]
+
+
+def collect_observations(domain: Domain, runs: Path, num_recordings: int) -> ActionObservations:
+    """The recordings of every action of the domain, made now if they are not there."""
+    return observations.collect(
+        domain.folder(runs) / f"recordings-{num_recordings}",
+        domain.play.record_block,
+        format=domain.play.format,
+        universe=domain.universe,
+        ids=np.arange(domain.universe.num_actions, dtype=np.int32),
+        num_recordings=num_recordings,
+        seed=REPRESENTATION_SEED,
+        block_actions=domain.play.block_actions,
+    )
+
+
+def train_representation(
+    domain: Domain,
+    runs: Path,
+    name: str,
+    budget_name: str,
+    *,
+    seed: int = REPRESENTATION_SEED,
+    assignments: list[str] | None = None,
+    workdir: Path | None = None,
+    overwrite: bool = False,
+    command_line: dict[str, Any] | None = None,
+) -> RunDirectory:
+    """Trains (or resumes, or finds complete) an encoder; its table covers every action.
+
+    Returns:
+      The run directory, closed, with `table.npz` and `split.json` in it; without the table if the
+      run was interrupted.
+    """
+    kind, modality = parse_representation(domain, name)
+    budget: StageOneBudget = budget_of(domain.task.stage_one, budget_name, "Stage one")
+    recordings = collect_observations(domain, runs, budget.num_recordings)
+    config = config_lib.set_paths(
+        EmbedConfig(
+            task=domain.task.name,
+            representation=name,
+            split=domain.split_name,
+            split_hash=domain.split.hash,
+            observations_hash=recordings.hash,
+            seed=seed,
+            train_on="train",
+            model=budget.configs[kind],
+        ),
+        assignments or [],
+    )
+    path = workdir or domain.folder(runs) / f"embed-{name}-{domain.split_name}-{budget_name}-{seed}"
+    with RunDirectory.open_or_create(
+        path, config_lib.to_dict(config), overwrite, {"split_hash": domain.split.hash}
+    ) as run:
+        learner = RepresentationLearner(config.model, modality)
+        rows = recordings.rows(domain.split.ids(config.train_on))
+        data = jnp.asarray(recordings.data[rows])
+        if not (path / TABLE_FILE).exists():
+            print(f"Training {name} ({config.model.num_steps} steps; {budget.cost}) in {path}.")
+        result = loop.run(
+            learner.init(jax.random.key(config.seed), data.shape),
+            chunk=lambda state, n: _train_chunk(learner, data, state, n),
+            run_directory=run,
+            total_steps=config.model.num_steps,
+            chunk_steps=budget.chunk_steps,
+            checkpoint_every=budget.checkpoint_every,
+            title=name,
+            steps_unit="steps",
+            work_per_step=config.model.actions_per_batch * config.model.recordings_per_action,
+            work_unit="trajectories",
+            shown_metrics=("loss", "kl_action"),
+        )
+        if not result.was_interrupted and not (path / TABLE_FILE).exists():
+            domain.split.save(path / SPLIT_FILE)
+            table = RepresentationTable(
+                vectors=learner.encode(result.state, recordings.data),
+                ids=recordings.ids,
+                universe_hash=domain.universe.hash,
+                split_hash=domain.split.hash,
+                source=f"{name}, {budget_name}, seed {config.seed}",
+            )
+            table.save(path / TABLE_FILE)
+            run.add_provenance(table_hash=table.hash)
+    return run
+
+
+def _train_chunk(
+    learner: RepresentationLearner, data: jax.Array, state: RepresentationState, n: int
+) -> Any:
+    state, metrics = learner.train_steps(state, data, n)
+    metrics["nonfinite/loss_and_gradient"] = metrics.pop("nonfinite")
+    return state, metrics
+
+
+def load_encoder(path: Path) -> tuple[EmbedConfig, RepresentationLearner, RepresentationState, Any]:
+    """The frozen encoder of a stage-one run: (config, learner, state, its task's play format).
+
+    Raises:
+      RunDirectoryError, CheckpointError: `path` is no such run, or has no readable checkpoint.
+    """
+    from experiments._flags import load_task
+
+    run = RunDirectory.load(path)
+    config = config_lib.from_dict(EmbedConfig, run.config)
+    domain = Domain.of(load_task(config.task), config.split)
+    _, modality = parse_representation(domain, config.representation)
+    learner = RepresentationLearner(config.model, modality)
+    shape = (
+        config.model.actions_per_batch * 8,
+        config.model.recordings_per_action,
+        *domain.play.format.shape,
+    )
+    example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
+    state, _ = Checkpointer(run.checkpoints).restore("latest", example)
+    return config, learner, state, domain.play.format
+
+
+def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> RepresentationTable:
+    """The table behind `--representation`, trained now if it has to be.
+
+    Raises:
+      UsageError: there is no such representation, or its training was interrupted.
+      SplitMismatch: the table belongs to another universe or split.
+    """
+    path = Path(representation)
+    if representation in domain.universe.engineered:
+        table = engineered_table(domain.universe, representation)
+    elif path.is_dir() or path.suffix == ".npz":
+        table = RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
+    else:
+        run = train_representation(domain, runs, representation, budget)
+        if not (run.path / TABLE_FILE).exists():
+            raise UsageError(f"{representation} was interrupted; run again to go on.")
+        table = RepresentationTable.load(run.path / TABLE_FILE)
+    table.check(domain.universe, domain.split)
+    return table

@@ -1,0 +1,99 @@
+"""Flags that the commands share, and what they have in common at the start."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from absl import app, flags, logging
+
+from jaxnew.task import Task
+
+TASK = flags.DEFINE_string("task", "grid_world", "Task name, or package.module:TASK.")
+METHOD = flags.DEFINE_string("method", "ours", "Policy method.")
+REPRESENTATION = flags.DEFINE_string(
+    "representation",
+    "hvae",
+    "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot), a run "
+    "directory of embed, or an .npz table.",
+)
+SPLIT = flags.DEFINE_string("split", None, "Name of the split; default: the task's first.")
+BUDGET = flags.DEFINE_string("budget", "laptop", "smoke, laptop, paper (stage one also: fast).")
+SEED = flags.DEFINE_integer("seed", 31, "Seed of the run.")
+WORKDIR = flags.DEFINE_string("workdir", None, "Directory of the run; default: below --runs.")
+RUNS = flags.DEFINE_string("runs", "runs", "Where runs and what they share are kept.")
+OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an existing run instead of resuming.")
+SET = flags.DEFINE_multi_string("set", [], "path.to.field=value, for any field of the config.")
+DEBUG_NANS = flags.DEFINE_bool("debug_nans", False, "Stop at the operation that makes a NaN.")
+
+
+class UsageError(ValueError):
+    """The command was asked for something that does not exist or does not fit."""
+
+
+def load_task(name: str) -> Task:
+    """A task by name (`grid_world`) or by place (`package.module:TASK`).
+
+    Raises:
+      UsageError: there is no such module or object, or it is not a `Task`.
+    """
+    module_name, _, attribute = name.partition(":")
+    if not attribute:
+        module_name, attribute = f"experiments.tasks.{name}", "TASK"
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as err:
+        if err.name is None or not module_name.startswith(err.name):
+            raise
+        known = sorted(path.stem for path in (Path(__file__).parent / "tasks").glob("[a-z]*.py"))
+        raise UsageError(
+            f"Unknown task {name!r}: there is no module {module_name}. Tasks: {', '.join(known)}; "
+            "or give package.module:TASK for one of your own."
+        ) from err
+    task = getattr(module, attribute, None)
+    if not isinstance(task, Task):
+        raise UsageError(f"{module_name}:{attribute} is {task!r}, not a jaxnew.task.Task.")
+    return task
+
+
+def budget_of(stage: Any, name: str, what: str) -> Any:
+    """The preset called `name`.
+
+    Raises:
+      UsageError: there is none of that name.
+    """
+    if name not in stage:
+        raise UsageError(f"{what} has no budget {name!r}; choose one of {', '.join(stage)}.")
+    return stage[name]
+
+
+def configure_jax() -> None:
+    """Compiled programs are kept between processes; `--debug_nans` is obeyed."""
+    import jax
+
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "jaxnew"))
+    jax.config.update("jax_compilation_cache_dir", cache)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    jax.config.update("jax_debug_nans", DEBUG_NANS.value)
+
+
+def run_command(main: Callable[[], None]) -> None:
+    """Runs a command's `main`; a user's mistake ends it with one line instead of a traceback."""
+
+    def wrapped(arguments: Sequence[str]) -> None:
+        if len(arguments) > 1:
+            sys.exit(f"Unknown argument {arguments[1]!r}; every option is a --flag=value.")
+        logging.set_verbosity(logging.WARNING)  # Orbax logs every file it writes.
+        configure_jax()
+        try:
+            main()
+        except (ValueError, ArithmeticError) as err:
+            if DEBUG_NANS.value or os.environ.get("JAXNEW_TRACEBACK"):
+                raise
+            sys.exit(f"{type(err).__name__}: {err}\n(JAXNEW_TRACEBACK=1 shows where.)")
+
+    app.run(wrapped)

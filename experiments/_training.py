@@ -1,0 +1,206 @@
+"""What `train`, `evaluate`, `sweep` and `demo` share: a policy's config, its parts, its run."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
+from experiments._flags import load_task
+from jaxnew import config as config_lib
+from jaxnew import loop
+from jaxnew.actions import ActionSplit
+from jaxnew.checkpoint import Checkpointer, Kind
+from jaxnew.evaluation import Evaluator
+from jaxnew.policy import make_method
+from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.run_directory import RunDirectory
+from jaxnew.sampling import ActionPool, check_set_size
+from jaxnew.task import LoopConfig, StageTwoBudget, Task
+
+EVALUATION_SEED = 2020  # Shared by all runs, so that they are evaluated on the same episodes.
+SPLITS_WATCHED = ("train", "validation")
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """All that fixes a policy's run."""
+
+    task: str
+    method: str
+    representation: str
+    table_hash: str
+    split: str
+    split_hash: str
+    seed: int
+    num_updates: int
+    ppo: PPOConfig
+    hyperparameters: Hyperparameters
+    loop: LoopConfig
+
+    @classmethod
+    def of(
+        cls,
+        domain: Domain,
+        method: str,
+        representation: str,
+        table: RepresentationTable,
+        budget: StageTwoBudget,
+        seed: int,
+    ) -> TrainConfig:
+        return cls(
+            task=domain.task.name,
+            method=method,
+            representation=representation,
+            table_hash=table.hash,
+            split=domain.split_name,
+            split_hash=domain.split.hash,
+            seed=seed,
+            num_updates=budget.num_updates,
+            ppo=budget.ppo,
+            hyperparameters=budget.hyperparameters,
+            loop=budget.loop,
+        )
+
+
+@dataclass(frozen=True)
+class Trainer:
+    """The compiled parts of a run."""
+
+    config: TrainConfig
+    task: Task
+    learner: Learner
+    evaluator: Evaluator
+    table: jax.Array
+    pools: dict[str, ActionPool]
+
+    @classmethod
+    def of(
+        cls, config: TrainConfig, task: Task, split: ActionSplit, table: RepresentationTable
+    ) -> Trainer:
+        """Builds the parts.
+
+        Raises:
+          ValueError: unknown method, or sets larger than the train or validation pool.
+        """
+        env = task.make_environment()
+        method = make_method(config.method)
+        vectors = table.rows(np.arange(env.action_spec.num_actions))
+        rollout_config = config.ppo.rollout
+        pools = {
+            name: ActionPool.of(
+                split.ids(name), capacity=len(vectors), always_available=split.always_available
+            )
+            for name in ("train", "validation", "test")
+        }
+        for name in SPLITS_WATCHED:
+            check_set_size(pools[name], rollout_config.set_size, f"the {name} actions")
+        evaluator = Evaluator(
+            env,
+            env.default_params,
+            method,
+            rollout_config.set_size,
+            rollout_config.padded_set_size,
+            rollout_config.normalize_observations,
+        )
+        rollout = DeviceRollout(env, env.default_params, method, rollout_config)
+        learner = Learner(rollout, config.ppo)
+        return cls(config, task, learner, evaluator, jnp.asarray(vectors), pools)
+
+    def init(self) -> TrainState:
+        """The state before the first update."""
+        key = jax.random.key(self.config.seed)
+        return jax.jit(self.learner.init)(key, self.table, self.pools["train"])
+
+    def chunk(self, state: TrainState, num_updates: int) -> tuple[TrainState, dict[str, Any]]:
+        """`num_updates` updates in one call, and their metrics reduced."""
+        return self._updates(
+            state,
+            self.config.hyperparameters,
+            self.table,
+            self.pools["train"],
+            num_updates=num_updates,
+        )
+
+    @cached_property
+    def _updates(self) -> Any:
+        return jax.jit(self.learner.updates, static_argnames="num_updates")
+
+    def evaluate(self, state: TrainState) -> dict[str, float]:
+        """Mean episode metrics on train and validation sets, from fixed keys."""
+        results = {}
+        for name in SPLITS_WATCHED:
+            episodes = self.evaluator.run(
+                state.params,
+                state.rollout.observation_statistics,
+                self.table,
+                self.pools[name],
+                jax.random.key(EVALUATION_SEED),
+                self.config.loop.evaluation_episodes,
+            )
+            results |= {f"{name}/{metric}": float(v.mean()) for metric, v in episodes.items()}
+        return results
+
+    @property
+    def selection_metric(self) -> str:
+        return f"validation/{self.task.selection_metric}"
+
+
+def train(trainer: Trainer, run: RunDirectory, title: str) -> loop.LoopResult[TrainState]:
+    """Trains a policy in an open run directory, from where it stands to the end."""
+    config = trainer.config
+    return loop.run(
+        trainer.init(),
+        chunk=trainer.chunk,
+        evaluate=trainer.evaluate,
+        run_directory=run,
+        total_steps=config.num_updates,
+        chunk_steps=config.loop.chunk_updates,
+        evaluate_every=config.loop.evaluate_every,
+        checkpoint_every=config.loop.checkpoint_every,
+        selection_metric=trainer.selection_metric,
+        title=title,
+        work_per_step=config.ppo.steps_per_update,
+        shown_metrics=(f"episode/{trainer.task.selection_metric}", "policy/entropy"),
+    )
+
+
+def save_inputs(run: RunDirectory, split: ActionSplit, table: RepresentationTable) -> None:
+    """Keeps the split and the table in the run directory, so that it needs nothing else."""
+    if not (run.path / TABLE_FILE).exists():
+        split.save(run.path / SPLIT_FILE)
+        table.save(run.path / TABLE_FILE)
+
+
+def load_trainer(path: Path) -> tuple[RunDirectory, Trainer, ActionSplit]:
+    """A run's config and parts, from its directory alone.
+
+    Raises:
+      RunDirectoryError: `path` is not a run of `train`.
+      SplitMismatch: split or table were changed since.
+    """
+    run = RunDirectory.load(path)
+    config = config_lib.from_dict(TrainConfig, run.config)
+    task = load_task(config.task)
+    split = ActionSplit.load(path / SPLIT_FILE)
+    split.check(task.make_universe())
+    table = RepresentationTable.load(path / TABLE_FILE)
+    table.check(task.make_universe(), split)
+    return run, Trainer.of(config, task, split, table), split
+
+
+def load_state(run: RunDirectory, trainer: Trainer, kind: Kind) -> tuple[TrainState, int]:
+    """A checkpointed state and the update it was saved at."""
+    example = jax.eval_shape(
+        trainer.learner.init, jax.random.key(0), trainer.table, trainer.pools["train"]
+    )
+    state, _ = Checkpointer(run.checkpoints).restore(kind, example)
+    return state, int(state.step)

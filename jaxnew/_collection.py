@@ -1,0 +1,205 @@
+"""Collecting recordings into a directory, whatever kills the process meanwhile. NumPy only."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxnew._files import take_lock, write_json_atomically
+from jaxnew._progress import ProgressDisplay
+from jaxnew._recordings import (
+    DATA,
+    FORMAT_VERSION,
+    KIND,
+    MANIFEST,
+    ObservationsError,
+    RecordingFormat,
+    checked_ids,
+    manifest_hash,
+    open_data,
+    read_manifest,
+    row_hash,
+)
+from jaxnew.actions import ActionUniverse, content_hash
+from jaxnew.config import differences
+
+RecordBlock = Callable[[int, np.ndarray, int], np.ndarray]
+
+
+def collect_into(
+    path: Path,
+    record_block: RecordBlock,
+    *,
+    format: RecordingFormat,
+    universe: ActionUniverse,
+    ids: np.ndarray,
+    num_recordings: int,
+    seed: int,
+    block_actions: int,
+    play_settings: Mapping[str, Any],
+) -> None:
+    """See `jaxnew.observations.collect`."""
+    ids = checked_ids(ids, universe, "collect")
+    if num_recordings < 1 or block_actions < 1:
+        raise ObservationsError(
+            f"num_recordings={num_recordings} and block_actions={block_actions} must be at least 1."
+        )
+    settings = _settings(format, universe, ids, num_recordings, seed, play_settings)
+    path.mkdir(parents=True, exist_ok=True)
+    if not (path / MANIFEST).exists() and any(
+        not name.startswith(".") for name in os.listdir(path)
+    ):
+        raise ObservationsError(
+            f"{path} is not empty and has no {MANIFEST}. Choose another directory."
+        )
+    try:
+        lock = take_lock(path / ".lock")
+    except BlockingIOError as err:
+        raise ObservationsError(f"{path} is being collected by another process ({err}).") from err
+    try:
+        _Collection(path, format, ids, num_recordings, settings).run(
+            record_block, seed, min(block_actions, len(ids))
+        )
+    finally:
+        os.close(lock)
+
+
+def _settings(
+    format: RecordingFormat,
+    universe: ActionUniverse,
+    ids: np.ndarray,
+    num_recordings: int,
+    seed: int,
+    play_settings: Mapping[str, Any],
+) -> dict[str, Any]:
+    """What fixes the recordings, as plain JSON."""
+    settings = {
+        "universe": {"name": universe.name, "hash": universe.hash},
+        "format": {
+            "modality": format.modality,
+            "shape": list(format.shape),
+            "dtype": format.dtype,
+            "low": format.low,
+            "high": format.high,
+        },
+        "num_actions": len(ids),
+        "ids_hash": content_hash(ids),
+        "num_recordings": num_recordings,
+        "seed": seed,
+        "play": dict(play_settings),
+    }
+    return dict(json.loads(json.dumps(settings, allow_nan=False)))
+
+
+class _Collection:
+    """A recording directory that is being filled."""
+
+    def __init__(
+        self,
+        path: Path,
+        format: RecordingFormat,
+        ids: np.ndarray,
+        num_recordings: int,
+        settings: dict[str, Any],
+    ) -> None:
+        self._path, self._format, self._ids = path, format, ids
+        self._shape = (len(ids), num_recordings, *format.shape)
+        self._hashes: list[str | None] = [None] * len(ids)
+        self._settings = settings
+        if (path / MANIFEST).exists():
+            manifest = read_manifest(path)
+            found = differences(manifest["settings"], settings)
+            if found:
+                lines = [
+                    f"  {name}: {old!r} recorded, {new!r} asked for" for name, old, new in found
+                ]
+                raise ObservationsError(
+                    f"{path} holds recordings with other settings:\n" + "\n".join(lines) + "\n"
+                    "Choose another directory, or delete that one."
+                )
+            self._hashes = manifest["action_hashes"]
+
+    def run(self, record_block: RecordBlock, seed: int, block: int) -> None:
+        self._write_manifest()
+        self._forget_damaged()
+        pending = [row for row, digest in enumerate(self._hashes) if digest is None]
+        done = len(self._ids) - len(pending)
+        size = self._format.estimate_bytes(len(self._ids), self._shape[1])
+        with ProgressDisplay("Recording", len(self._ids), "actions", done) as progress:
+            progress.say(
+                f"{self._format.modality}: {len(self._ids)} actions x {self._shape[1]} recordings, "
+                f"{size / 1e6:,.1f} MB in {self._path}; {done} are there already."
+            )
+            for start in range(0, len(pending), block):
+                rows = np.array(pending[start : start + block])
+                # The last block is filled up, so that a compiled recorder is compiled once.
+                padded = np.concatenate([rows, np.repeat(rows[:1], block - len(rows))])
+                recorded = np.asarray(record_block(seed, self._ids[padded], self._shape[1]))
+                problem = self._format.problem(recorded, (block, *self._shape[1:]), True)
+                if problem is not None:
+                    raise ObservationsError(f"What record_block returned {problem}.")
+                self._store(rows, recorded[: len(rows)])
+                progress.update(done + start + len(rows))
+
+    def _forget_damaged(self) -> None:
+        """Makes the data file if it is absent or unusable; forgets actions that it does not hold."""
+        try:
+            data = open_data(self._path, self._format, self._shape)
+        except ObservationsError as err:
+            if any(self._hashes):
+                warnings.warn(f"{err} Recording everything again.", stacklevel=4)
+            self._hashes = [None] * len(self._ids)
+            self._write_manifest()
+            self._create_data()
+            return
+        for row, digest in enumerate(self._hashes):
+            if digest is not None and row_hash(data[row]) != digest:
+                warnings.warn(
+                    f"{self._path}: action {self._ids[row]} is damaged; recording it again.",
+                    stacklevel=4,
+                )
+                self._hashes[row] = None
+
+    def _create_data(self) -> None:
+        needed = self._format.estimate_bytes(len(self._ids), self._shape[1])
+        free = shutil.disk_usage(self._path).free
+        if needed > free:
+            raise ObservationsError(
+                f"{self._path} needs {needed / 1e6:,.0f} MB, but only {free / 1e6:,.0f} MB are "
+                "free. Record fewer actions or fewer times, or use another disk."
+            )
+        temporary = self._path / f".{DATA}"
+        np.lib.format.open_memmap(temporary, "w+", np.dtype(self._format.dtype), self._shape)
+        os.replace(temporary, self._path / DATA)
+
+    def _store(self, rows: np.ndarray, recorded: np.ndarray) -> None:
+        """Writes rows to disk, and only then says in the manifest that they are there."""
+        data = open_data(self._path, self._format, self._shape)
+        row_bytes = data.nbytes // len(data)
+        # Plain writes: a full disk is an error here, but kills a process that writes to a map.
+        with (self._path / DATA).open("r+b") as file:
+            for row, recording in zip(rows.tolist(), recorded, strict=True):
+                file.seek(data.offset + row * row_bytes)
+                file.write(np.ascontiguousarray(recording).tobytes())
+                self._hashes[row] = row_hash(recording)
+            file.flush()
+            os.fsync(file.fileno())
+        self._write_manifest()
+
+    def _write_manifest(self) -> None:
+        manifest: dict[str, Any] = {
+            "kind": KIND,
+            "format_version": FORMAT_VERSION,
+            "settings": self._settings,
+            "ids": self._ids.tolist(),
+            "action_hashes": self._hashes,
+        }
+        manifest["hash"] = manifest_hash(manifest)
+        write_json_atomically(self._path / MANIFEST, manifest)

@@ -1,0 +1,100 @@
+"""One progress display for every long-running command: a bar on a terminal, lines elsewhere."""
+
+from __future__ import annotations
+
+import time
+from types import TracebackType
+from typing import Any, Self
+
+_PLAIN_EVERY_S = 10.0
+
+
+def _rich_bar() -> Any | None:
+    """A rich progress bar if rich is installed and the output is a terminal, else None."""
+    try:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+    except ImportError:
+        return None
+    console = Console()
+    if not console.is_terminal:
+        return None
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        TextColumn("{task.completed:.0f}/{task.total:.0f} {task.fields[unit]}"),
+        TextColumn("{task.fields[note]}"),
+        TimeRemainingColumn(),
+        console=console,
+    )
+
+
+def duration(seconds: float) -> str:
+    """`1:02:03` or `2:03`."""
+    minutes, second = divmod(int(seconds), 60)
+    hours, minute = divmod(minutes, 60)
+    return f"{hours}:{minute:02d}:{second:02d}" if hours else f"{minute}:{second:02d}"
+
+
+class ProgressDisplay:
+    """Shows how far a job is. A context manager; `update` may be called as often as wanted.
+
+    Args:
+      title: what runs.
+      total: the number of steps at the end.
+      unit: what a step is called.
+      start: steps done before this process started; they do not count into the rate.
+    """
+
+    def __init__(self, title: str, total: int, unit: str, start: int = 0) -> None:
+        self._title, self._total, self._unit = title, total, unit
+        self._mark = (start, time.monotonic())
+        self._last_line_s = float("-inf")
+        self._bar = _rich_bar()
+        self._task = (
+            None
+            if self._bar is None
+            else self._bar.add_task(title, total=total, completed=start, unit=unit, note="")
+        )
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def restart_clock(self, done: int) -> None:
+        """Leaves what was done so far, such as compilation, out of the time-left estimate."""
+        self._mark = (done, time.monotonic())
+
+    def say(self, message: str) -> None:
+        """Prints a line of its own, above the bar if there is one."""
+        if self._bar is not None:
+            self._bar.console.print(message, markup=False, highlight=False)
+        else:
+            print(message, flush=True)
+
+    def update(self, done: int, note: str = "") -> None:
+        """Moves to `done` steps, with a short note such as key metrics."""
+        if self._bar is not None:
+            self._bar.update(self._task, completed=done, note=note)
+            return
+        now = time.monotonic()
+        if now - self._last_line_s < _PLAIN_EVERY_S and done < self._total:
+            return
+        self._last_line_s = now
+        start, since = self._mark
+        rate = (done - start) / (now - since) if now > since else 0.0
+        left = f", {duration((self._total - done) / rate)} left" if rate > 0 else ""
+        print(
+            f"{self._title}: {done}/{self._total} {self._unit}{left}{'  ' + note if note else ''}",
+            flush=True,
+        )

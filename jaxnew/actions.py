@@ -1,0 +1,264 @@
+"""Action universes and their splits. NumPy only, so that host workers can import it.
+
+An *action universe* numbers every action of a domain `0..A-1` and says what is known about each
+of them; an *action split* says which of them an agent trains with and which it has never seen.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+SPLIT_NAMES = ("train", "validation", "test")
+
+
+class SplitMismatch(ValueError):
+    """Two artefacts belong to different universes or splits."""
+
+
+def content_hash(*parts: np.ndarray | str | int) -> str:
+    """Short SHA-256 over arrays (dtype, shape, bytes) and scalars; equal on every machine."""
+    digest = hashlib.sha256()
+    for part in parts:
+        if isinstance(part, np.ndarray):
+            little_endian = np.ascontiguousarray(part, dtype=part.dtype.newbyteorder("<"))
+            digest.update(f"{little_endian.dtype.str}{little_endian.shape}".encode())
+            digest.update(little_endian.tobytes())
+        else:
+            digest.update(repr(part).encode())
+        digest.update(b"|")
+    return digest.hexdigest()[:16]
+
+
+@dataclass(frozen=True)
+class ActionUniverse:
+    """All actions of a domain.
+
+    Attributes:
+      name: domain and version, e.g. `GridWorld-v0`.
+      class_labels: int32[A] class of each action, an index into `class_names`.
+      class_names: name of each class, in label order.
+      primary_parameter: f64[A] the number by which actions of one class differ (angle, scale, ...).
+      action_names: A printable names.
+      engineered: named ground-truth vectors, each f32[A, e].
+      content: array [A, ...] that fixes what each action does; two actions with equal rows are the
+        same action under two ids.
+    """
+
+    name: str
+    class_labels: np.ndarray
+    class_names: tuple[str, ...]
+    primary_parameter: np.ndarray
+    action_names: tuple[str, ...]
+    content: np.ndarray
+    engineered: Mapping[str, np.ndarray] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        per_action = {
+            "class_labels": self.class_labels,
+            "primary_parameter": self.primary_parameter,
+            "action_names": self.action_names,
+            **{f"engineered[{key!r}]": value for key, value in self.engineered.items()},
+        }
+        for attribute, value in per_action.items():
+            if len(value) != self.num_actions:
+                raise ValueError(
+                    f"{self.name}: {attribute} has {len(value)} rows, but content has "
+                    f"{self.num_actions}; every attribute needs one row per action."
+                )
+        if self.num_actions and not 0 <= self.class_labels.min() <= self.class_labels.max() < len(
+            self.class_names
+        ):
+            raise ValueError(
+                f"{self.name}: class_labels span {self.class_labels.min()}.."
+                f"{self.class_labels.max()}, but there are {len(self.class_names)} class names."
+            )
+
+    @property
+    def num_actions(self) -> int:
+        return len(self.content)
+
+    @property
+    def hash(self) -> str:
+        """Identifies the universe by name and by what each action does."""
+        return content_hash(self.name, np.asarray(self.content))
+
+    def content_keys(self) -> list[bytes]:
+        """One key per action; equal keys mean equal actions."""
+        rows = np.ascontiguousarray(self.content).reshape(self.num_actions, -1)
+        return [row.tobytes() for row in rows]
+
+
+@dataclass(frozen=True)
+class ActionSplit:
+    """Which actions are trained with, selected by, and tested on.
+
+    Attributes:
+      train, validation, test: int32[...] ascending ids, disjoint.
+      universe_hash: `ActionUniverse.hash` of the universe that the ids belong to.
+      seed: the seed that drew the split, or None for a split given by hand.
+      always_available: ids in every available set (CREATE's no-op), part of no pool below.
+    """
+
+    train: np.ndarray
+    validation: np.ndarray
+    test: np.ndarray
+    universe_hash: str
+    seed: int | None = None
+    always_available: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        owner: dict[int, str] = {}
+        for name in (*SPLIT_NAMES, "always_available"):
+            ids = np.asarray(getattr(self, name), np.int32)
+            if ids.ndim != 1 or (name in SPLIT_NAMES and ids.size == 0):
+                raise ValueError(f"{name} must be a non-empty list of ids, got shape {ids.shape}.")
+            object.__setattr__(self, name, np.sort(ids))
+            for action_id in ids.tolist():
+                if action_id in owner:
+                    raise ValueError(
+                        f"Action {action_id} is in both {owner[action_id]} and {name}; "
+                        "each id may be listed once."
+                    )
+                owner[action_id] = name
+
+    @property
+    def hash(self) -> str:
+        """Identifies the split: universe and membership."""
+        return content_hash(
+            self.universe_hash, self.train, self.validation, self.test, self.always_available
+        )
+
+    def ids(self, name: str) -> np.ndarray:
+        """int32[n] ids of one part of the split, or of the union `all`."""
+        if name == "all":
+            return np.sort(np.concatenate([self.train, self.validation, self.test]))
+        if name not in SPLIT_NAMES:
+            raise ValueError(f"Unknown split {name!r}; choose one of {(*SPLIT_NAMES, 'all')}.")
+        return getattr(self, name)
+
+    def check(self, universe: ActionUniverse) -> None:
+        """Raises unless the split belongs to `universe` and is disjoint by content.
+
+        Raises:
+          SplitMismatch: the split was made for another universe.
+          ValueError: an id does not exist, or the same action stands in two parts under two ids.
+        """
+        if self.universe_hash != universe.hash:
+            raise SplitMismatch(
+                f"The split was made for universe {self.universe_hash}, but {universe.name} is "
+                f"{universe.hash}. Make the split again from this universe."
+            )
+        keys = universe.content_keys()
+        owner: dict[bytes, str] = {}
+        for name in SPLIT_NAMES:
+            ids = getattr(self, name)
+            if ids[0] < 0 or ids[-1] >= universe.num_actions:
+                raise ValueError(
+                    f"{name} holds ids {ids[0]}..{ids[-1]}; {universe.name} has 0.."
+                    f"{universe.num_actions - 1}."
+                )
+            for action_id in ids.tolist():
+                if owner.setdefault(keys[action_id], name) != name:
+                    raise ValueError(
+                        f"Action {action_id} ({universe.action_names[action_id]}) of {name} does "
+                        f"the same as an action of {owner[keys[action_id]]}."
+                    )
+
+    def save(self, path: Path) -> None:
+        record = {
+            "universe_hash": self.universe_hash,
+            "seed": self.seed,
+            "hash": self.hash,
+            **{name: getattr(self, name).tolist() for name in (*SPLIT_NAMES, "always_available")},
+        }
+        path.write_text(json.dumps(record))
+
+    @classmethod
+    def load(cls, path: Path) -> ActionSplit:
+        """Reads what `save` wrote.
+
+        Raises:
+          SplitMismatch: the ids do not have the hash recorded beside them.
+        """
+        record = json.loads(path.read_text())
+        recorded_hash = record.pop("hash")
+        names = (*SPLIT_NAMES, "always_available")
+        split = cls(**{k: np.array(v, np.int32) if k in names else v for k, v in record.items()})
+        if split.hash != recorded_hash:
+            raise SplitMismatch(
+                f"{path} was edited or damaged: its ids hash to {split.hash}, it says "
+                f"{recorded_hash}. Restore the file or make the split again."
+            )
+        return split
+
+
+def random_halves_split(universe: ActionUniverse, seed: int) -> ActionSplit:
+    """Random halves, the second cut in two: the paper's 2:1:1 (spec method 2.1).
+
+    Actions with equal content are kept on one side, so the parts are disjoint by content.
+    """
+    rng = np.random.default_rng(seed)
+    keys = np.array([hash_id for hash_id in _group_by_content(universe)])
+    groups = rng.permutation(len(np.unique(keys)))
+    half, three_quarters = len(groups) // 2, len(groups) // 2 + len(groups) // 4
+
+    def members(chosen: np.ndarray) -> np.ndarray:
+        return np.flatnonzero(np.isin(keys, chosen)).astype(np.int32)
+
+    split = ActionSplit(
+        train=members(groups[:half]),
+        validation=members(groups[half:three_quarters]),
+        test=members(groups[three_quarters:]),
+        universe_hash=universe.hash,
+        seed=seed,
+    )
+    split.check(universe)
+    return split
+
+
+def _group_by_content(universe: ActionUniverse) -> list[int]:
+    """The group number of each action; actions with equal content share one."""
+    first_seen: dict[bytes, int] = {}
+    return [first_seen.setdefault(key, len(first_seen)) for key in universe.content_keys()]
+
+
+def mixture_ids(seen: np.ndarray, unseen: np.ndarray, unseen_ratio: float) -> np.ndarray:
+    """A pool with about the given share of unseen actions (paper figure 9c, spec method 10).
+
+    The first `floor(x * |unseen|)` unseen and the first `floor((1 - x) * |seen|)` seen ids; sets
+    drawn from it hold the share only on average, as in the released analysis.
+    """
+    if not 0.0 <= unseen_ratio <= 1.0:
+        raise ValueError(f"unseen_ratio={unseen_ratio} is not in [0, 1].")
+    num_unseen = int(unseen_ratio * len(unseen))
+    num_seen = int((1.0 - unseen_ratio) * len(seen))
+    return np.concatenate([unseen[:num_unseen], seen[:num_seen]]).astype(np.int32)
+
+
+def load_ids(path: Path, universe: ActionUniverse) -> np.ndarray:
+    """int32[n] action ids from a text file: one id per line or separated by commas or spaces.
+
+    Raises:
+      ValueError: the file holds something else than ids of `universe`, or an id twice.
+    """
+    words = path.read_text().replace(",", " ").split()
+    try:
+        ids = np.array([int(word) for word in words], np.int32)
+    except ValueError as err:
+        raise ValueError(f"{path} must hold integer action ids only: {err}.") from err
+    if ids.size == 0:
+        raise ValueError(f"{path} holds no action id.")
+    outside = ids[(ids < 0) | (ids >= universe.num_actions)]
+    if outside.size:
+        raise ValueError(
+            f"{path} names action {outside[0]}; {universe.name} has 0..{universe.num_actions - 1}."
+        )
+    if len(np.unique(ids)) != len(ids):
+        raise ValueError(f"{path} names an action twice; list each id once.")
+    return ids

@@ -1,0 +1,245 @@
+"""Checkpoints of a run: the only module that names Orbax.
+
+A checkpoint holds the leaves of a state (any pytree), a description of each leaf with its hash,
+and a plain dictionary. It appears in one rename, so whatever kills the process leaves earlier
+ones readable; a damaged one is recognised by its hashes.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import shutil
+import uuid
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal, TypeVar, cast
+
+import jax
+import numpy as np
+import orbax.checkpoint as ocp
+
+from jaxnew import _leaves
+from jaxnew._files import sync_folder
+
+State = TypeVar("State")
+Kind = Literal["latest", "best"]
+KINDS: tuple[Kind, ...] = ("latest", "best")
+_KEEP = {"latest": 2, "best": 3}
+_FORMAT_VERSION = 1
+
+
+class CheckpointError(ValueError):
+    """There is no readable checkpoint, or it holds another state than the one asked for."""
+
+
+def record_hash(record: Mapping[str, Any]) -> str:
+    """Hash of the record of a checkpoint without its own `hash` entry."""
+    return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
+
+
+class _Damaged(Exception):
+    """One checkpoint cannot be read; another may do."""
+
+
+class Checkpointer:
+    """Saves and restores the checkpoints of one run, in `directory/KIND/STEP`.
+
+    Of kind `latest` the two newest are kept, of kind `best` the three newest, so that there is one
+    to fall back on. Saving is synchronous. One process writes; any number may read.
+    """
+
+    def __init__(self, directory: Path | str) -> None:
+        self._directory = Path(directory).absolute()
+        self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
+
+    @property
+    def directory(self) -> Path:
+        return self._directory
+
+    def steps(self, kind: Kind) -> list[int]:
+        """Steps of the committed checkpoints of a kind, ascending."""
+        folder = self._folder(kind)
+        names = os.listdir(folder) if folder.is_dir() else []
+        return sorted(int(name) for name in names if name.isdecimal())
+
+    def save(
+        self, kind: Kind, step: int, state: Any, metadata: Mapping[str, Any] | None = None
+    ) -> Path:
+        """Writes a checkpoint and then deletes those of its kind that are not kept.
+
+        Args:
+          kind: `latest` or `best`.
+          step: >= 0, larger than that of every checkpoint of this kind (see `discard_after`).
+          state: pytree of arrays, typed PRNG keys and Python numbers; not changed.
+          metadata: plain JSON.
+
+        Raises:
+          ValueError: `step` is not larger, or `metadata` is not plain JSON.
+          TypeError: a leaf cannot be stored.
+        """
+        folder, existing = self._folder(kind), self.steps(kind)
+        if step < 0 or (existing and step <= existing[-1]):
+            raise ValueError(
+                f"Cannot save {kind} at step {step}: {folder} already holds step "
+                f"{existing[-1] if existing else '(none)'}. Steps must grow; call discard_after "
+                "when a run goes back to an earlier step."
+            )
+        leaves = [
+            _leaves.describe_with_content(name, leaf) for name, leaf in _leaves.named_leaves(state)
+        ]
+        record: dict[str, Any] = {
+            "format_version": _FORMAT_VERSION,
+            "step": step,
+            "leaves": [description for description, _ in leaves],
+            "metadata": json.loads(json.dumps(metadata or {}, allow_nan=False)),
+        }
+        record["hash"] = record_hash(record)
+        self._clean(folder)
+        temporary = folder / f"new-{uuid.uuid4().hex}"
+        items: dict[str, Any] = {"record": ocp.args.JsonSave(record)}
+        # Orbax refuses empty arrays; the description alone restores those.
+        filled = {str(i): value for i, (_, value) in enumerate(leaves) if value.size}
+        if filled:
+            items["state"] = ocp.args.PyTreeSave(filled)
+        self._orbax.save(temporary, ocp.args.Composite(**items))
+        os.rename(temporary, self._path(kind, step))
+        sync_folder(folder)
+        for old in existing[: 1 - _KEEP[kind]]:
+            self._discard(kind, old)
+        return self._path(kind, step)
+
+    def restore(
+        self, kind: Kind, example: State, step: int | None = None
+    ) -> tuple[State, dict[str, Any]]:
+        """Reads the newest readable checkpoint of a kind.
+
+        Args:
+          kind: `latest` or `best`.
+          example: a state of the same structure, shapes and dtypes; concrete, or made of
+            `jax.ShapeDtypeStruct`. Arrays are placed where those of `example` are.
+          step: read this one only, instead of the newest.
+
+        Returns:
+          (state, metadata): the state with the bits that were saved.
+
+        Raises:
+          CheckpointError: none is readable, or the newest holds another structure.
+        """
+        found = self._newest(kind, step, lambda path: self._read(path, example))
+        return cast(tuple[State, dict[str, Any]], found)
+
+    def metadata(self, kind: Kind, step: int | None = None) -> dict[str, Any]:
+        """Metadata of the newest checkpoint of a kind whose record is readable.
+
+        Raises:
+          CheckpointError: there is none.
+        """
+        return cast(
+            dict[str, Any],
+            self._newest(kind, step, lambda path: self._read_record(path)["metadata"]),
+        )
+
+    def discard_after(self, step: int) -> None:
+        """Deletes every checkpoint of a later step, of both kinds: the run goes on from `step`."""
+        for kind in KINDS:
+            for later in self.steps(kind):
+                if later > step:
+                    self._discard(kind, later)
+
+    def _newest(self, kind: Kind, step: int | None, read: Any) -> Any:
+        steps = self.steps(kind) if step is None else [step]
+        failures = []
+        for candidate in reversed(steps):
+            path = self._path(kind, candidate)
+            try:
+                found = read(path)
+            except _Damaged as err:
+                failures.append(f"{path} is damaged ({err})")
+                continue
+            if failures:
+                warnings.warn(f"{'; '.join(failures)}; using step {candidate}.", stacklevel=3)
+            return found
+        if failures:
+            raise CheckpointError(
+                f"No readable checkpoint: {'; '.join(failures)}. Restore it from a copy, or delete "
+                f"{self._folder(kind)} to start this run anew."
+            )
+        raise CheckpointError(
+            f"There is no {kind} checkpoint in {self._directory}. Train the run first, or give the "
+            "--workdir of another."
+        )
+
+    def _read_record(self, path: Path) -> dict[str, Any]:
+        if not path.is_dir():
+            raise _Damaged("it does not exist")
+        try:
+            args = ocp.args.Composite(record=ocp.args.JsonRestore())
+            record = self._orbax.restore(path, args).record
+            if record.pop("hash") != record_hash(record):
+                raise ValueError("its record is not what was saved")
+        except Exception as err:  # Orbax and TensorStore raise many types for damaged files.
+            raise _Damaged(f"{type(err).__name__}: {str(err)[:200]}") from err
+        if record["format_version"] != _FORMAT_VERSION:
+            raise CheckpointError(
+                f"{path} has format {record['format_version']}; this program reads {_FORMAT_VERSION}. Use the "
+                "version of the program that wrote it."
+            )
+        return cast(dict[str, Any], record)
+
+    def _read(self, path: Path, example: Any) -> tuple[Any, dict[str, Any]]:
+        record = self._read_record(path)
+        leaves, saved = _leaves.named_leaves(example), record["leaves"]
+        difference = _leaves.first_difference(
+            saved, [_leaves.describe(name, leaf) for name, leaf in leaves]
+        )
+        if difference is not None:
+            raise CheckpointError(
+                f"{path} does not fit this program: {difference}. Use the configuration and the "
+                "version of the program that wrote it."
+            )
+        values = dict(zip((leaf["path"] for leaf in saved), self._read_values(path, saved)))
+        by_path = {leaf["path"]: leaf for leaf in saved}
+        restored = [_leaves.restore(values[name], by_path[name], leaf) for name, leaf in leaves]
+        return jax.tree.unflatten(jax.tree.structure(example), restored), record["metadata"]
+
+    def _read_values(self, path: Path, saved: list[_leaves.Leaf]) -> list[np.ndarray]:
+        values = [np.zeros(leaf["stored"][1], np.dtype(leaf["stored"][0])) for leaf in saved]
+        target = {str(i): value for i, value in enumerate(values) if value.size}
+        if target:
+            try:
+                kinds = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in target}
+                restore = ocp.args.PyTreeRestore(item=target, restore_args=kinds)
+                found = self._orbax.restore(path, ocp.args.Composite(state=restore)).state
+            except Exception as err:  # As above.
+                raise _Damaged(f"{type(err).__name__}: {str(err)[:200]}") from err
+            for name, value in found.items():
+                values[int(name)] = np.asarray(value)
+        for leaf, value in zip(saved, values, strict=True):
+            if _leaves.sha256(value) != leaf["sha256"]:
+                raise _Damaged(f"the bytes of leaf {leaf['path']} are not those that were saved")
+        return values
+
+    def _folder(self, kind: Kind) -> Path:
+        if kind not in KINDS:
+            raise ValueError(f"Unknown kind of checkpoint {kind!r}; choose one of {KINDS}.")
+        return self._directory / kind
+
+    def _path(self, kind: Kind, step: int) -> Path:
+        return self._folder(kind) / f"{step:012d}"
+
+    def _discard(self, kind: Kind, step: int) -> None:
+        """Deletes one checkpoint; it is gone at once even if deleting its files is cut short."""
+        doomed = self._folder(kind) / f"old-{uuid.uuid4().hex}"
+        os.rename(self._path(kind, step), doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
+
+    @staticmethod
+    def _clean(folder: Path) -> None:
+        """Makes `folder` and removes what a killed process left half-written or half-deleted."""
+        folder.mkdir(parents=True, exist_ok=True)
+        for name in os.listdir(folder):
+            if name.startswith(("new-", "old-")):
+                shutil.rmtree(folder / name, ignore_errors=True)

@@ -1,0 +1,7 @@
+"""Stage 2: what acts. A policy scores any list of action representations."""
+
+from jaxnew.policy.distributions import Categorical
+from jaxnew.policy.method import METHODS, PolicyMethod, make_method
+from jaxnew.policy.utility import UtilityMethod
+
+__all__ = ["METHODS", "Categorical", "PolicyMethod", "UtilityMethod", "make_method"]

@@ -1,0 +1,53 @@
+"""Probability distributions over choices, in float32 and safe with masks."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+MASKED_LOGIT = -1e9  # Finite, so that a set with every entry masked has no NaN.
+
+
+@struct.dataclass
+class Categorical:
+    """A choice among the last axis of `logits`.
+
+    Attributes:
+      logits: f32[..., m] unnormalised log-probabilities; `MASKED_LOGIT` where masked. If all
+        entries of a set are masked, the distribution is uniform over them.
+    """
+
+    logits: jax.Array
+
+    @classmethod
+    def masked(cls, logits: jax.Array, mask: jax.Array) -> Categorical:
+        """Gives the entries where `mask` (bool[..., m]) is false a probability of zero."""
+        return cls(jnp.where(mask, logits, MASKED_LOGIT))
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """int32[...] choices; consumes `key`.
+
+        One uniform number per choice and the inverse of the cumulative probability: the Gumbel trick
+        of `jax.random.categorical` draws m numbers and takes 2 m logarithms for each.
+        """
+        cumulative = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
+        total = cumulative[..., -1:]
+        uniform = jax.random.uniform(key, total.shape)
+        # Below the total, so that rounding never selects an entry of probability zero.
+        threshold = jnp.minimum(uniform * total, jnp.nextafter(total, 0.0))
+        return jnp.argmax(cumulative > threshold, axis=-1).astype(jnp.int32)
+
+    def log_prob(self, choice: jax.Array) -> jax.Array:
+        """f32[...] log-probability of int32[...] choices."""
+        log_probs = jax.nn.log_softmax(self.logits)
+        return jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
+
+    def entropy(self) -> jax.Array:
+        """f32[...] entropy in nats."""
+        log_probs = jax.nn.log_softmax(self.logits)
+        return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
+
+    def mode(self) -> jax.Array:
+        """int32[...] most likely choice, the first of equals."""
+        return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)

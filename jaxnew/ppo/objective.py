@@ -1,0 +1,122 @@
+"""The PPO objective (spec method 6)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxnew.policy import PolicyMethod
+from jaxnew.sampling import AvailableSet
+
+
+@struct.dataclass
+class Hyperparameters:
+    """Numbers that a sweep may vary: all traced, so that one program serves every value.
+
+    Attributes:
+      learning_rate: of Adam at the start; it falls linearly to a tenth over `lr_steps`.
+      entropy_coefficient: weight of the mean entropy.
+      clip: of the probability ratio, and of the value's change.
+      discount: gamma.
+      gae_lambda: lambda of the advantage estimator.
+      value_coefficient: weight of the value loss.
+    """
+
+    learning_rate: float = 1e-3
+    entropy_coefficient: float = 0.05
+    clip: float = 0.1
+    discount: float = 0.99
+    gae_lambda: float = 0.95
+    value_coefficient: float = 0.5
+
+
+@struct.dataclass
+class Minibatch:
+    """Transitions to learn from; every field is `[B, ...]`.
+
+    Attributes:
+      observation: f32[B, ...] normalised.
+      available: sets [B, m].
+      sample: what the policy drew, a pytree.
+      log_prob: f32[B] its log-probability then.
+      value: f32[B] value then.
+      advantage: f32[B] normalised over the whole rollout.
+      value_target: f32[B].
+    """
+
+    observation: jax.Array
+    available: AvailableSet
+    sample: Any
+    log_prob: jax.Array
+    value: jax.Array
+    advantage: jax.Array
+    value_target: jax.Array
+
+
+def normalize_advantages(advantages: jax.Array) -> jax.Array:
+    """Subtracts the mean and divides by the standard deviation + 1e-5, over all of them.
+
+    The deviation is the sample one (n - 1), as in the original's PyTorch code.
+    """
+    return (advantages - jnp.mean(advantages)) / (jnp.std(advantages, ddof=1) + 1e-5)
+
+
+def loss(
+    params: Any,
+    projected_table: jax.Array,
+    minibatch: Minibatch,
+    method: PolicyMethod,
+    hyperparameters: Hyperparameters,
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Clipped surrogate, clipped value loss and entropy bonus, means over the minibatch.
+
+    Args:
+      params: of the policy.
+      projected_table: f32[A, p] `method.project(params, table)`; handed in, so that it is computed
+        once per gradient step.
+      minibatch: B transitions.
+      method: the policy.
+      hyperparameters: traced weights.
+
+    Returns:
+      The total loss f32[] and its parts, for the log.
+    """
+    distribution = method.distribution(
+        params,
+        minibatch.observation,
+        projected_table[minibatch.available.ids],
+        minibatch.available.mask,
+    )
+    log_ratio = distribution.log_prob(minibatch.sample) - minibatch.log_prob
+    ratio = jnp.exp(log_ratio)
+    clip = hyperparameters.clip
+    policy_loss = -jnp.mean(
+        jnp.minimum(
+            ratio * minibatch.advantage,
+            jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * minibatch.advantage,
+        )
+    )
+    value = method.value(params, minibatch.observation)
+    clipped_value = minibatch.value + jnp.clip(value - minibatch.value, -clip, clip)
+    value_loss = 0.5 * jnp.mean(
+        jnp.maximum(
+            (value - minibatch.value_target) ** 2, (clipped_value - minibatch.value_target) ** 2
+        )
+    )
+    entropy = jnp.mean(distribution.entropy())
+    total = (
+        policy_loss
+        + hyperparameters.value_coefficient * value_loss
+        - hyperparameters.entropy_coefficient * entropy
+    )
+    return total, {
+        "loss/total": total,
+        "loss/policy": policy_loss,
+        "loss/value": value_loss,
+        "policy/entropy": entropy,
+        "policy/approximate_kl": jnp.mean(ratio - 1.0 - log_ratio),
+        "policy/clipped": jnp.mean((jnp.abs(ratio - 1.0) > clip).astype(jnp.float32)),
+    }

@@ -1,0 +1,77 @@
+"""Networks that predict recordings from latents (spec method 3.6)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from jaxnew.representation.encoders import Dense, LSTMWeights, ResBlock, lstm_cell
+
+
+class DecoderStart(nn.Module):
+    """Latents -> the features `g` that every decoder starts from.
+
+    `g = ReLU(Lin(z) + Lin(c))`; the flat VAE has no action latent: `g = ReLU(Lin(z))` (spec
+    method 3.6 and 4).
+
+    Attributes:
+      width: H.
+      pytorch_init: see `Dense`.
+    """
+
+    width: int
+    pytorch_init: bool = False
+
+    @nn.compact
+    def __call__(self, z: jax.Array, c: jax.Array | None) -> jax.Array:
+        """(z f32[B, S, dz], c f32[B, dc] or None) -> g f32[B, S, H]."""
+        g = Dense(self.width, self.pytorch_init, name="from_observation")(z)
+        if c is not None:
+            g = g + Dense(self.width, self.pytorch_init, name="from_action")(c)[:, None]
+        return nn.relu(g)
+
+
+class TrajectoryDecoder(nn.Module):
+    """Predicts steps 1..T-1 of a recording from its step 0, feeding back its own predictions.
+
+    Spec method 3.6, "Sequences". For one-hot features the predictions are raw logits, and raw
+    logits are fed back.
+
+    Attributes:
+      width: H.
+      pytorch_init: see `Dense`.
+    """
+
+    width: int
+    pytorch_init: bool = False
+
+    @nn.compact
+    def __call__(self, g: jax.Array, first_step: jax.Array, num_steps: int) -> jax.Array:
+        """Decodes.
+
+        Args:
+          g: f32[B, S, H] from `DecoderStart`.
+          first_step: f32[B, S, D] the recordings' true step 0.
+          num_steps: T, at least 2.
+        Returns:
+          f32[B, S, T-1, D] predicted means (or logits) of steps 1..T-1.
+        """
+        dim = first_step.shape[-1]
+        read = Dense(self.width, self.pytorch_init, name="read")
+        before = ResBlock(2, self.pytorch_init, name="before_lstm")
+        after = ResBlock(2, self.pytorch_init, name="after_lstm")
+        write = Dense(dim, self.pytorch_init, name="write")
+        weights = LSTMWeights(self.width, name="lstm")(self.width)
+        kernel_input, kernel_hidden, bias = weights
+
+        step, hidden, cell = first_step, None, None
+        predictions = []
+        for _ in range(num_steps - 1):
+            gates = (g * before(read(step))) @ kernel_input + bias
+            if hidden is not None:
+                gates = gates + hidden @ kernel_hidden
+            hidden, cell = lstm_cell(gates, cell)
+            step = write(after(hidden))
+            predictions.append(step)
+        return jnp.stack(predictions, axis=-2)

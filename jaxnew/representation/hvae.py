@@ -1,0 +1,146 @@
+"""The hierarchical VAE: a set of recordings -> one latent per action (spec method 3, paper 4.1).
+
+Both networks `q(z | o, c)` and `p(z | c)` of the release hold one more dense layer, for a second
+stochastic layer that is never used (spec method 3.5); it is left out here.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from jaxnew.representation.decoders import DecoderStart, TrajectoryDecoder
+from jaxnew.representation.encoders import (
+    Dense,
+    LatentHead,
+    ResBlock,
+    ScalarBatchNorm,
+    TrajectoryEncoder,
+    likelihood_log_variance,
+)
+from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
+
+
+class ActionInference(nn.Module):
+    """`q(c | O)`: encoded recordings of an action -> a Gaussian (spec method 3.3).
+
+    Attributes:
+      width: Ho.
+      latent: dc.
+    """
+
+    width: int
+    latent: int
+
+    @nn.compact
+    def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
+        """f32[B, S, E] -> (mean f32[B, dc], log-variance f32[B, dc]); blind to the order of S."""
+        e = ResBlock(2)(nn.relu(Dense(self.width)(h)))
+        # Spec 3.3 has Lin, then the mean over S. The two commute, and the mean is the cheaper start.
+        e = Dense(self.width)(jnp.mean(e, axis=1))
+        e = Dense(2 * self.latent)(ResBlock(3)(e))
+        mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2, axis=-1)
+        return mean, log_variance
+
+
+class ObservationInference(nn.Module):
+    """`q(z | o, c)`: an encoded recording and its action -> a Gaussian (spec method 3.4).
+
+    Attributes:
+      width: H.
+      latent: dz.
+    """
+
+    width: int
+    latent: int
+
+    @nn.compact
+    def __call__(
+        self, h: jax.Array, c: jax.Array, training: bool
+    ) -> tuple[jax.Array, jax.Array]:
+        """(f32[B, S, E], f32[B, dc]) -> (mean f32[B, S, dz], log-variance f32[dz])."""
+        from_recording = Dense(self.width, name="from_recording")(h)
+        from_action = Dense(self.width, name="from_action")(c)
+        e = nn.relu(from_recording + from_action[:, None])
+        return LatentHead(self.latent)(e, training)
+
+
+class LatentPrior(nn.Module):
+    """`p(z | c)` (spec method 3.5).
+
+    Attributes:
+      width: H.
+      latent: dz.
+    """
+
+    width: int
+    latent: int
+
+    @nn.compact
+    def __call__(self, c: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
+        """f32[B, dc] -> (mean f32[B, 1, dz], log-variance f32[dz])."""
+        e = nn.relu(Dense(self.width)(c))[:, None]
+        return LatentHead(self.latent)(e, training)
+
+
+class HVAE(nn.Module):
+    """The hierarchical VAE for trajectories.
+
+    Attributes:
+      encoder_width: E.
+      inference_width: Ho.
+      hidden_width: H.
+      action_latent: dc.
+      observation_latent: dz.
+      gaussian_dim: D for a Gaussian likelihood, whose log-variance is a free vector of that length;
+        0 for a categorical one, which has no variance.
+    """
+
+    encoder_width: int
+    inference_width: int
+    hidden_width: int
+    action_latent: int
+    observation_latent: int
+    gaussian_dim: int
+
+    def setup(self) -> None:
+        self.encoder = TrajectoryEncoder(self.encoder_width)
+        self.action_inference = ActionInference(self.inference_width, self.action_latent)
+        self.observation_inference = ObservationInference(
+            self.hidden_width, self.observation_latent
+        )
+        self.latent_prior = LatentPrior(self.hidden_width, self.observation_latent)
+        self.decoder_start = DecoderStart(self.hidden_width)
+        self.decoder = TrajectoryDecoder(self.hidden_width)
+        self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
+
+    def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
+        """One pass through inference, prior and decoder.
+
+        Args:
+          features: f32[B, S, T, D] recordings of B actions.
+          noise: of the two sampled latents.
+          training: True normalises with batch statistics and updates the running averages.
+        """
+        h = self.encoder(features)
+        action_mean, action_log_variance = self.action_inference(h, training)
+        c = sample_gaussian(action_mean, action_log_variance, noise.action)
+        observation_mean, observation_log_variance = self.observation_inference(h, c, training)
+        z = sample_gaussian(observation_mean, observation_log_variance, noise.observation)
+        prior_mean, prior_log_variance = self.latent_prior(c, training)
+        prediction = self.decoder(self.decoder_start(z, c), features[:, :, 0], features.shape[2])
+        return VAEOutput(
+            action_mean=action_mean,
+            action_log_variance=action_log_variance,
+            observation_mean=observation_mean,
+            observation_log_variance=observation_log_variance,
+            prior_mean=prior_mean,
+            prior_log_variance=prior_log_variance,
+            prediction=prediction,
+            likelihood_log_variance=self.likelihood_log_variance,
+        )
+
+    def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """`q(c | O)` with running averages: f32[B, S, T, D] -> (mean, log-variance) f32[B, dc]."""
+        return self.action_inference(self.encoder(features), False)

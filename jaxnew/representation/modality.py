@@ -1,0 +1,79 @@
+"""What was recorded, and how a stored recording becomes the networks' input."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+
+GAUSSIAN = "gaussian"
+CATEGORICAL = "categorical"
+
+
+@dataclass(frozen=True)
+class Modality:
+    """How stored recordings become network inputs.
+
+    Attributes:
+      name: for messages and file names, e.g. "xy" or "onehot".
+      feature_dim: D, numbers per time step after `featurize`.
+      likelihood: "gaussian" or "categorical".
+      num_categories: categories per coordinate for a categorical likelihood, whose D numbers are
+        one-hot blocks of that size, one after the other; 0 for a Gaussian one.
+      featurize: stored recordings [..., T, D0], uint8 or float -> f32[..., T, D]; pure JAX.
+
+    Raises:
+      ValueError: the fields contradict each other.
+    """
+
+    name: str
+    feature_dim: int
+    likelihood: str
+    num_categories: int
+    featurize: Callable[[jax.Array], jax.Array]
+
+    def __post_init__(self) -> None:
+        if self.likelihood not in (GAUSSIAN, CATEGORICAL):
+            raise ValueError(
+                f"Modality {self.name!r}: unknown likelihood {self.likelihood!r}; choose "
+                f"{GAUSSIAN!r} or {CATEGORICAL!r}."
+            )
+        if self.feature_dim < 1:
+            raise ValueError(f"Modality {self.name!r}: feature_dim={self.feature_dim} must be >= 1.")
+        is_categorical = self.likelihood == CATEGORICAL
+        if is_categorical != (self.num_categories > 0):
+            raise ValueError(
+                f"Modality {self.name!r}: num_categories={self.num_categories} does not fit "
+                f"likelihood={self.likelihood!r}; it is positive for {CATEGORICAL!r}, 0 otherwise."
+            )
+        if is_categorical and self.feature_dim % self.num_categories:
+            raise ValueError(
+                f"Modality {self.name!r}: feature_dim={self.feature_dim} is not a multiple of "
+                f"num_categories={self.num_categories}."
+            )
+
+    @property
+    def gaussian_dim(self) -> int:
+        """D if the likelihood is Gaussian, else 0."""
+        return 0 if self.num_categories else self.feature_dim
+
+
+def vector_modality(name: str, feature_dim: int) -> Modality:
+    """Stored vectors as they are, converted to float32, with a Gaussian likelihood."""
+    return Modality(name, feature_dim, GAUSSIAN, 0, _as_float)
+
+
+def one_hot_modality(name: str, num_coordinates: int, num_categories: int) -> Modality:
+    """Stored integer coordinates [..., T, num_coordinates] as one-hot blocks (spec grid 5)."""
+
+    def featurize(recordings: jax.Array) -> jax.Array:
+        blocks = jax.nn.one_hot(recordings, num_categories, dtype=jnp.float32)
+        return blocks.reshape(*recordings.shape[:-1], num_coordinates * num_categories)
+
+    return Modality(name, num_coordinates * num_categories, CATEGORICAL, num_categories, featurize)
+
+
+def _as_float(recordings: jax.Array) -> jax.Array:
+    return recordings.astype(jnp.float32)

@@ -1,0 +1,179 @@
+"""Terms of the evidence lower bound (spec method 3.7). Pure functions."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+# Spec method 3.7: bounds of the log-variance inside the Gaussian likelihood, and only there.
+LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -4.0, 3.0
+
+
+@struct.dataclass
+class ElboTerms:
+    """What the loss is made of; each summed over the batch and divided by its B*S recordings.
+
+    Attributes:
+      reconstruction: f32[] log-likelihood of the scored steps.
+      kl_action: f32[] divergence of the action posteriors from N(0, I), each action counted once
+        (so 1/S per recording); zero for the flat VAE.
+      kl_observation: f32[] divergence of the recordings' posteriors from their prior.
+    """
+
+    reconstruction: jax.Array
+    kl_action: jax.Array
+    kl_observation: jax.Array
+
+
+@struct.dataclass
+class VAEOutput:
+    """Distributions of one forward pass, for either VAE.
+
+    Attributes:
+      action_mean, action_log_variance: f32[B, dc] posterior q(c | O); None for the flat VAE.
+      observation_mean: f32[B, S, dz] and observation_log_variance: f32[dz], posterior of z.
+      prior_mean: f32[B, 1, dz] and prior_log_variance: f32[dz], prior of z; zeros (N(0, I)) for
+        the flat VAE.
+      prediction: f32[B, S, T-1, D] means or logits of the steps 1..T-1.
+      likelihood_log_variance: f32[D], None for a categorical likelihood.
+    """
+
+    action_mean: jax.Array | None
+    action_log_variance: jax.Array | None
+    observation_mean: jax.Array
+    observation_log_variance: jax.Array
+    prior_mean: jax.Array
+    prior_log_variance: jax.Array
+    prediction: jax.Array
+    likelihood_log_variance: jax.Array | None
+
+
+def gaussian_log_likelihood(
+    target: jax.Array, mean: jax.Array, log_variance: jax.Array
+) -> jax.Array:
+    """Log-density of diagonal Gaussians, log(2 pi) included, summed over the last axis.
+
+    The log-variance is clamped to [-4, 3] here (spec method 3.7); outside, its gradient is zero.
+
+    Args:
+      target: f32[..., D].
+      mean: f32[..., D].
+      log_variance: f32[D] or f32[..., D].
+    Returns:
+      f32[...].
+    """
+    log_variance = jnp.clip(log_variance, LOG_VARIANCE_MIN, LOG_VARIANCE_MAX)
+    squared_error = jnp.square(target - mean) * jnp.exp(-log_variance)
+    return -0.5 * jnp.sum(squared_error + log_variance + math.log(2.0 * math.pi), axis=-1)
+
+
+def categorical_log_likelihood(
+    target: jax.Array, logits: jax.Array, num_categories: int
+) -> jax.Array:
+    """Log-probability of one-hot coordinates, summed over coordinates (spec method 3.7).
+
+    Args:
+      target: f32[..., D] one-hot blocks of `num_categories`, one block per coordinate.
+      logits: f32[..., D] in the same layout.
+      num_categories: size K of a block; D is a multiple of it.
+    Returns:
+      f32[...].
+    """
+    blocks = (*logits.shape[:-1], logits.shape[-1] // num_categories, num_categories)
+    log_probabilities = jax.nn.log_softmax(logits.reshape(blocks))
+    return jnp.sum(target.reshape(blocks) * log_probabilities, axis=(-2, -1))
+
+
+def gaussian_kl(
+    mean: jax.Array,
+    log_variance: jax.Array,
+    prior_mean: jax.Array | float = 0.0,
+    prior_log_variance: jax.Array | float = 0.0,
+) -> jax.Array:
+    """KL(N(mean, e^log_variance) || N(prior)) of diagonal Gaussians, summed over the last axis.
+
+    Args:
+      mean: f32[..., d].
+      log_variance: f32[d] or f32[..., d], not clamped (spec method 3.7).
+      prior_mean: broadcasts against `mean`; zero by default.
+      prior_log_variance: broadcasts against `mean`; zero by default.
+    Returns:
+      f32[...].
+    """
+    log_ratio = log_variance - prior_log_variance
+    squared = jnp.square(mean - prior_mean) * jnp.exp(-prior_log_variance)
+    return 0.5 * jnp.sum(jnp.exp(log_ratio) - log_ratio + squared - 1.0, axis=-1)
+
+
+@struct.dataclass
+class LatentNoise:
+    """Standard normal draws behind the sampled latents of one pass.
+
+    Attributes:
+      action: f32[B, dc]; not read by the flat VAE.
+      observation: f32[B, S, dz].
+    """
+
+    action: jax.Array
+    observation: jax.Array
+
+
+def draw_noise(
+    key: jax.Array, batch_shape: tuple[int, int], action_latent: int, observation_latent: int
+) -> LatentNoise:
+    """Noise for `batch_shape` = (B, S) recordings; consumes `key`."""
+    key_action, key_observation = jax.random.split(key)
+    return LatentNoise(
+        action=jax.random.normal(key_action, (batch_shape[0], action_latent)),
+        observation=jax.random.normal(key_observation, (*batch_shape, observation_latent)),
+    )
+
+
+def sample_gaussian(mean: jax.Array, log_variance: jax.Array, noise: jax.Array) -> jax.Array:
+    """`mean + exp(log_variance / 2) * noise`; all f32, shapes broadcast to that of `mean`."""
+    return mean + jnp.exp(0.5 * log_variance) * noise
+
+
+def reconstruction_weight(epoch: jax.Array) -> jax.Array:
+    """`w = 1 + 0.5^epoch`, f32[], of an int32[] epoch counted from 0 (spec method 3.7)."""
+    return 1.0 + jnp.exp2(-jnp.asarray(epoch, jnp.float32))
+
+
+def weighted_loss(terms: ElboTerms, weight: jax.Array | float) -> jax.Array:
+    """`-(w * reconstruction - KL / w)`, f32[] (spec method 3.7); w = 1 gives the negative ELBO."""
+    return (terms.kl_action + terms.kl_observation) / weight - weight * terms.reconstruction
+
+
+def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> ElboTerms:
+    """The terms of the bound for one batch (spec method 3.7).
+
+    Args:
+      output: of the model's forward pass on `features`.
+      features: f32[B, S, T, D]; step 0 is given to the decoder and not scored.
+      num_categories: 0 for a Gaussian likelihood, else categories per coordinate.
+    """
+    target = features[:, :, 1:]
+    if num_categories:
+        log_likelihood = categorical_log_likelihood(target, output.prediction, num_categories)
+    else:
+        log_likelihood = gaussian_log_likelihood(
+            target, output.prediction, output.likelihood_log_variance
+        )
+    kl_observation = gaussian_kl(
+        output.observation_mean,
+        output.observation_log_variance,
+        output.prior_mean,
+        output.prior_log_variance,
+    )
+    kl_action = jnp.zeros(())
+    if output.action_mean is not None:
+        kl_action = jnp.sum(gaussian_kl(output.action_mean, output.action_log_variance))
+    num_recordings = features.shape[0] * features.shape[1]
+    return ElboTerms(
+        reconstruction=jnp.sum(log_likelihood) / num_recordings,
+        kl_action=kl_action / num_recordings,
+        kl_observation=jnp.sum(kl_observation) / num_recordings,
+    )

@@ -1,0 +1,96 @@
+"""The flat VAE baseline: every recording on its own, no action latent (spec method 4)."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import linen as nn
+
+from jaxnew.representation.decoders import DecoderStart, TrajectoryDecoder
+from jaxnew.representation.encoders import (
+    Dense,
+    LatentHead,
+    TrajectoryEncoder,
+    likelihood_log_variance,
+)
+from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
+
+
+class FlatInference(nn.Module):
+    """`q(z | o)` of the flat VAE (spec method 4).
+
+    Attributes:
+      width: H.
+      latent: dz.
+    """
+
+    width: int
+    latent: int
+
+    @nn.compact
+    def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
+        """f32[..., E] -> (mean f32[..., dz], log-variance f32[dz])."""
+        e = nn.relu(Dense(self.width, pytorch_init=True)(h))
+        return LatentHead(self.latent, pytorch_init=True)(e, training)
+
+
+class FlatVAE(nn.Module):
+    """The flat VAE for trajectories: encoder, `q(z | o)`, decoder, prior N(0, I).
+
+    Dense layers keep PyTorch's default initialisation (spec method 4).
+
+    Attributes:
+      encoder_width: E.
+      hidden_width: H.
+      observation_latent: dz.
+      gaussian_dim: see `HVAE`.
+    """
+
+    encoder_width: int
+    hidden_width: int
+    observation_latent: int
+    gaussian_dim: int
+
+    def setup(self) -> None:
+        self.encoder = TrajectoryEncoder(self.encoder_width)
+        self.inference = FlatInference(self.hidden_width, self.observation_latent)
+        self.decoder_start = DecoderStart(self.hidden_width, pytorch_init=True)
+        self.decoder = TrajectoryDecoder(self.hidden_width, pytorch_init=True)
+        self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
+
+    def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
+        """One pass through inference and decoder.
+
+        Args:
+          features: f32[B, S, T, D]; which axis a recording lies on does not matter here.
+          noise: of the sampled latents.
+          training: True normalises with batch statistics and updates the running averages.
+        """
+        mean, log_variance = self.inference(self.encoder(features), training)
+        z = sample_gaussian(mean, log_variance, noise.observation)
+        prediction = self.decoder(
+            self.decoder_start(z, None), features[:, :, 0], features.shape[2]
+        )
+        return VAEOutput(
+            action_mean=None,
+            action_log_variance=None,
+            observation_mean=mean,
+            observation_log_variance=log_variance,
+            prior_mean=jnp.zeros_like(mean[:, :1]),
+            prior_log_variance=jnp.zeros_like(log_variance),
+            prediction=prediction,
+            likelihood_log_variance=self.likelihood_log_variance,
+        )
+
+    def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """An action's representation, with running averages (spec method 4).
+
+        Args:
+          features: f32[B, S, T, D].
+        Returns:
+          f32[B, dz] mean over S of the recordings' posterior means, and their shared
+          log-variance, f32[B, dz].
+        """
+        mean, log_variance = self.inference(self.encoder(features), False)
+        mean = jnp.mean(mean, axis=1)
+        return mean, jnp.broadcast_to(log_variance, mean.shape)

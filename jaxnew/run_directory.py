@@ -1,0 +1,304 @@
+"""The directory of one run: it explains itself, belongs to one process, and is never half-written.
+
+config.json       what the run is
+provenance.json   what made it: revision, versions, devices, command line of each session
+metrics.jsonl     one line per report (`metrics.py`); TensorBoard events in tensorboard/
+checkpoints/      `checkpoint.py`
+figures/  evaluation/*.json
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import tempfile
+import weakref
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from jaxnew._files import sync_folder, take_lock, write_json_atomically
+from jaxnew._provenance import describe_session
+from jaxnew.config import Difference, differences
+
+_KIND = "jaxnew run directory"
+_FORMAT_VERSION = 1
+_LOCK = ".lock"
+_FOLDERS = ("tensorboard", "checkpoints", "figures", "evaluation")
+
+
+class RunDirectoryError(ValueError):
+    """A path cannot be used as a run directory, or its files are damaged."""
+
+
+class RunDirectoryInUse(RunDirectoryError):
+    """Another process writes this run directory."""
+
+
+class ConfigMismatch(RunDirectoryError):
+    """The run directory belongs to a run with another configuration.
+
+    Attributes:
+      differences: `(path, recorded value, asked-for value)` of each field that differs.
+    """
+
+    def __init__(self, path: Path, found: list[Difference]) -> None:
+        self.differences = found
+        lines = [f"  {name}: {old!r} recorded, {new!r} asked for" for name, old, new in found]
+        super().__init__(
+            f"{path} holds a run with another configuration:\n" + "\n".join(lines) + "\n"
+            "Choose another --workdir to keep that run, or --overwrite to delete it and start anew."
+        )
+
+
+def _read_json(path: Path) -> Any:
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as err:
+        raise RunDirectoryError(
+            f"{path.parent} is not a run directory: {path.name} is missing. Give the --workdir of "
+            "a run."
+        ) from err
+    except (json.JSONDecodeError, UnicodeDecodeError) as err:
+        raise RunDirectoryError(
+            f"{path} is damaged ({err}). Restore it from a copy, or start a new run in another "
+            "--workdir."
+        ) from err
+
+
+def _read_object(path: Path) -> dict[str, Any]:
+    content = _read_json(path)
+    if not isinstance(content, dict):
+        raise RunDirectoryError(f"{path} is damaged: it must hold a JSON object, got {content!r}.")
+    return content
+
+
+def _lock(folder: Path) -> int:
+    """Takes the lock of a run directory; returns the descriptor that holds it."""
+    try:
+        return take_lock(folder / _LOCK)
+    except BlockingIOError as err:
+        raise RunDirectoryInUse(
+            f"{folder} is being written by another process ({err}). Wait until it ends, stop it, "
+            "or choose another --workdir."
+        ) from err
+
+
+class RunDirectory:
+    """A run on disk. Made by `open_or_create` (for writing, locked) or `load` (for reading).
+
+    Attributes:
+      path: the directory.
+      config: the plain configuration of the run.
+      is_resumed: whether the run existed when it was opened for writing.
+    """
+
+    def __init__(
+        self, path: Path, config: dict[str, Any], is_resumed: bool, lock: int | None
+    ) -> None:
+        self.path, self.config, self.is_resumed = path, config, is_resumed
+        # Released by close, when the object is dropped, and by the end of the process.
+        self._release = None if lock is None else weakref.finalize(self, os.close, lock)
+
+    @classmethod
+    def open_or_create(
+        cls,
+        path: Path | str,
+        config: Mapping[str, Any],
+        overwrite: bool = False,
+        extra_provenance: Mapping[str, Any] | None = None,
+    ) -> RunDirectory:
+        """Opens the run of `config` for writing; makes it where there is none.
+
+        Args:
+          path: absent or empty (a new run), or a run directory with the same configuration (it is
+            resumed).
+          config: plain JSON, e.g. of `config.to_dict`.
+          overwrite: replace an existing run. It is deleted after the new one is in place.
+          extra_provenance: recorded with this session, e.g. hashes of the split and the table.
+
+        Raises:
+          ConfigMismatch: the run there has another configuration.
+          RunDirectoryInUse: another process writes it.
+          RunDirectoryError: the path holds something else, or a damaged run.
+        """
+        path = Path(os.path.abspath(path))
+        plain = json.loads(json.dumps(config, allow_nan=False))
+        _restore_interrupted_overwrite(path)
+        is_empty = not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+        if is_empty:
+            run = cls(path, plain, False, _create(path, plain))
+        elif overwrite:
+            run = cls(path, plain, False, _replace(path, plain))
+        else:
+            run = _resume(cls, path, plain)
+        try:
+            if overwrite:
+                shutil.rmtree(_aside(path), ignore_errors=True)
+            run._record_session(extra_provenance or {})
+        except BaseException:
+            run.close()
+            raise
+        return run
+
+    @classmethod
+    def load(cls, path: Path | str) -> RunDirectory:
+        """Opens an existing run for reading; takes no lock and changes nothing.
+
+        Raises:
+          RunDirectoryError: `path` is not a run directory, or it is damaged.
+        """
+        path = Path(path)
+        _check_marker(path)
+        return cls(path, _read_object(path / "config.json"), True, None)
+
+    @property
+    def is_writable(self) -> bool:
+        """Whether this object holds the lock."""
+        return self._release is not None and self._release.alive
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    @property
+    def figures(self) -> Path:
+        return self.path / "figures"
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What `provenance.json` holds; `["sessions"]` lists each process that wrote the run."""
+        return _read_object(self.path / "provenance.json")
+
+    def add_provenance(self, **entries: Any) -> None:
+        """Adds plain JSON entries to the record of this session."""
+        self._check_writable()
+        provenance = self.provenance
+        provenance["sessions"][-1].update(entries)
+        write_json_atomically(self.path / "provenance.json", provenance)
+
+    def record_evaluation(self, name: str, content: Mapping[str, Any]) -> Path:
+        """Writes `evaluation/NAME.json`, replacing an earlier one. Needs no lock.
+
+        Raises:
+          ValueError: `name` is not a plain file name, or `content` is not plain JSON.
+        """
+        if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
+            raise ValueError(
+                f"Evaluation name {name!r} must consist of letters, digits, '.', '_' and '-'."
+            )
+        file = self.path / "evaluation" / f"{name}.json"
+        file.parent.mkdir(exist_ok=True)
+        write_json_atomically(file, dict(content))
+        return file
+
+    def close(self) -> None:
+        """Releases the lock; the object can still be read."""
+        if self._release is not None:
+            self._release()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _check_writable(self) -> None:
+        if not self.is_writable:
+            raise RunDirectoryError(
+                f"{self.path} is open for reading only; use RunDirectory.open_or_create to write."
+            )
+
+    def _record_session(self, extra: Mapping[str, Any]) -> None:
+        provenance = self.provenance
+        provenance["sessions"].append({**describe_session(), **extra})
+        write_json_atomically(self.path / "provenance.json", provenance)
+
+
+def _check_marker(path: Path) -> None:
+    """Raises unless `path` is a directory that `_create` made."""
+    if not path.is_dir():
+        raise RunDirectoryError(f"{path} is not a directory. Give the --workdir of a run.")
+    for name in ("config.json", "provenance.json"):
+        if not (path / name).exists():
+            raise RunDirectoryError(
+                f"{path} is not a run directory: it has no {name}. Choose a --workdir that does "
+                "not exist yet or is empty."
+            )
+    kind = _read_object(path / "provenance.json")
+    if kind.get("kind") != _KIND or kind.get("format_version") != _FORMAT_VERSION:
+        raise RunDirectoryError(
+            f"{path} is not a run directory of format {_FORMAT_VERSION}: provenance.json says "
+            f"{kind.get('kind')!r}, {kind.get('format_version')!r}. Choose another --workdir."
+        )
+
+
+def _resume(cls: type[RunDirectory], path: Path, config: dict[str, Any]) -> RunDirectory:
+    _check_marker(path)
+    found = differences(_read_object(path / "config.json"), config)
+    if found:
+        raise ConfigMismatch(path, found)
+    return cls(path, config, True, _lock(path))
+
+
+def _create(path: Path, config: dict[str, Any]) -> int:
+    """Makes the run at `path`, which is absent or empty, in one step; returns its lock."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.new-"))
+    os.chmod(folder, 0o755)
+    lock = _lock(folder)
+    try:
+        for name in _FOLDERS:
+            (folder / name).mkdir()
+        marker = {"kind": _KIND, "format_version": _FORMAT_VERSION, "sessions": []}
+        write_json_atomically(folder / "provenance.json", marker)
+        write_json_atomically(folder / "config.json", config)
+        os.rename(folder, path)
+    except BaseException as err:
+        os.close(lock)
+        shutil.rmtree(folder, ignore_errors=True)
+        if not isinstance(err, OSError):
+            raise
+        raise RunDirectoryError(
+            f"Cannot make the run directory {path}: {err}. Choose a --workdir inside a writable "
+            "directory; it must not be a mount point or a link."
+        ) from err
+    sync_folder(path.parent)
+    return lock
+
+
+def _aside(path: Path) -> Path:
+    """Where an existing run waits while the one that replaces it is put in place."""
+    return path.parent / f".{path.name}.replaced"
+
+
+def _restore_interrupted_overwrite(path: Path) -> None:
+    """Undoes a replacement that was killed between its two renames."""
+    if not os.path.lexists(path) and _aside(path).is_dir():
+        os.rename(_aside(path), path)
+
+
+def _replace(path: Path, config: dict[str, Any]) -> int:
+    """Puts a new run where one exists, and deletes the old one last; returns the new lock."""
+    if path.is_symlink():
+        raise RunDirectoryError(f"{path} is a link; give the directory itself to --overwrite it.")
+    _check_marker(path)
+    old_lock = _lock(path)
+    try:
+        shutil.rmtree(_aside(path), ignore_errors=True)
+        os.rename(path, _aside(path))
+        try:
+            lock = _create(path, config)
+        finally:
+            _restore_interrupted_overwrite(path)
+    finally:
+        os.close(old_lock)
+    return lock

@@ -1,0 +1,171 @@
+"""Available sets: the actions that an agent may choose from in one episode, drawn inside jit."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+
+@struct.dataclass
+class AvailableSet:
+    """What an agent may choose from.
+
+    Attributes:
+      ids: int32[m] action ids; padding repeats a valid id.
+      mask: bool[m] true for a real entry.
+    """
+
+    ids: jax.Array
+    mask: jax.Array
+
+
+@struct.dataclass
+class ActionPool:
+    """The actions that sets are drawn from, padded so that every pool runs the same program.
+
+    Attributes:
+      ids: int32[P] pool members first, then padding (repeats of the first member).
+      size: int32[] number of members.
+      always_available: int32[q] ids that stand in the first q slots of every set.
+    """
+
+    ids: jax.Array
+    size: jax.Array
+    always_available: jax.Array
+
+    @classmethod
+    def of(
+        cls, ids: np.ndarray, *, capacity: int, always_available: np.ndarray | None = None
+    ) -> ActionPool:
+        """Builds a pool of `ids`, padded to `capacity` (usually the size of the universe).
+
+        Raises:
+          ValueError: no id, an id twice, or more ids than `capacity`.
+        """
+        always = np.zeros(0, np.int32) if always_available is None else always_available
+        members = np.setdiff1d(np.asarray(ids, np.int32), always)
+        if members.size == 0 or len(np.unique(ids)) != len(ids):
+            raise ValueError(f"A pool needs distinct ids and at least one, got {ids}.")
+        if len(members) > capacity:
+            raise ValueError(f"{len(members)} ids do not fit a pool of capacity {capacity}.")
+        padded = np.full(capacity, members[0], np.int32)
+        padded[: len(members)] = members
+        return cls(jnp.asarray(padded), jnp.int32(len(members)), jnp.asarray(always, jnp.int32))
+
+
+def check_set_size(pool: ActionPool, set_size: int, name: str = "pool") -> None:
+    """Raises ValueError when `set_size` distinct actions cannot be drawn from `pool`."""
+    num_always = pool.always_available.shape[0]
+    available = int(pool.size) + num_always
+    if not num_always < set_size <= available:
+        raise ValueError(
+            f"Sets of {set_size} actions cannot be drawn from {name}, which has {available} "
+            f"({num_always} of them always available); "
+            f"choose a set size in {num_always + 1}..{available}."
+        )
+
+
+def whole_pool(pool: ActionPool) -> AvailableSet:
+    """The set that holds every member of `pool`, padded to its capacity and masked."""
+    num_always = pool.always_available.shape[0]
+    ids = jnp.concatenate([pool.always_available, pool.ids])
+    return AvailableSet(ids, jnp.arange(ids.shape[0]) < pool.size + num_always)
+
+
+def draw_sets(
+    keys: jax.Array, pool: ActionPool, set_size: int, padded_size: int | None = None
+) -> AvailableSet:
+    """Draws one set per key, exactly uniformly without replacement.
+
+    By sequential rejection where sets are small against the pool, which costs a fraction of sorting
+    noise over the pool (`experiments/benchmarks`), else by the sort.
+
+    Args:
+      keys: PRNG keys [...]; consumed.
+      pool: members to draw from; at least `set_size` with the always available ones
+        (`check_set_size`).
+      set_size: number of actions in a set, static.
+      padded_size: width of the result, static; entries past `set_size` are masked.
+
+    Returns:
+      AvailableSet with ids int32[..., padded_size] and mask bool[..., padded_size].
+    """
+    num_always = pool.always_available.shape[0]
+    num_drawn = set_size - num_always
+    flat_keys = keys.reshape(-1)
+    if 2 * num_drawn > pool.ids.shape[0]:
+        drawn = jax.vmap(lambda key: _by_sorting_noise(key, pool, num_drawn))(flat_keys)
+    else:
+        drawn = _by_rejection(flat_keys, pool, num_drawn)
+    always = jnp.broadcast_to(pool.always_available, (drawn.shape[0], num_always))
+    ids = jnp.concatenate([always, drawn], axis=1)
+    padding = (padded_size or set_size) - set_size
+    ids = jnp.pad(ids, ((0, 0), (0, padding)), mode="edge")
+    mask = jnp.broadcast_to(jnp.arange(set_size + padding) < set_size, ids.shape)
+    shape = (*keys.shape, set_size + padding)
+    return AvailableSet(ids.reshape(shape), mask.reshape(shape))
+
+
+def _by_sorting_noise(key: jax.Array, pool: ActionPool, count: int) -> jax.Array:
+    """int32[count] the members with the `count` largest of independent noise."""
+    noise = jax.random.uniform(key, pool.ids.shape)
+    noise = jnp.where(jnp.arange(pool.ids.shape[0]) < pool.size, noise, -1.0)
+    return pool.ids[jax.lax.top_k(noise, count)[1]]
+
+
+_REFILL_BLOCK = 8  # Candidates per set drawn at once to replace repeats.
+
+
+def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
+    """int32[B, count] distinct members, by sequential rejection.
+
+    `count` candidates are drawn at once; the places of those that repeat an earlier one are filled
+    by further candidates, in blocks, until no set has an open place. The batch is the minor axis,
+    and loops run over candidates: that is what the CPU vectorises.
+    """
+    key_pairs = jax.vmap(jax.random.split)(keys)
+    candidates = jax.vmap(lambda key: _random_below(key, (count,), pool.size))(key_pairs[:, 0]).T
+    place = jnp.arange(count)[:, None]
+
+    def mark_repeats(i: jax.Array, is_repeat: jax.Array) -> jax.Array:
+        return is_repeat | ((candidates == candidates[i]) & (place > i))
+
+    is_repeat = jax.lax.fori_loop(0, count - 1, mark_repeats, jnp.zeros(candidates.shape, bool))
+
+    def refill(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+        chosen, iteration = carry
+        keys_now = jax.vmap(jax.random.fold_in, in_axes=(0, None))(key_pairs[:, 1], iteration)
+        extra = jax.vmap(lambda key: _random_below(key, (_REFILL_BLOCK,), pool.size))(keys_now).T
+
+        def fill_first_open(i: jax.Array, chosen: jax.Array) -> jax.Array:
+            is_new = ~jnp.any(chosen == extra[i], axis=0)
+            return jnp.where((place == _first_open(chosen)) & is_new, extra[i], chosen)
+
+        chosen = jax.lax.fori_loop(0, _REFILL_BLOCK, fill_first_open, chosen)
+        return chosen, iteration + 1
+
+    chosen, _ = jax.lax.while_loop(
+        lambda carry: jnp.any(carry[0] < 0),
+        refill,
+        (jnp.where(is_repeat, -1, candidates), jnp.zeros((), jnp.int32)),
+    )
+    return pool.ids[chosen.T]
+
+
+def _first_open(chosen: jax.Array) -> jax.Array:
+    """int32[B] first row of chosen [count, B] that is -1, or `count`."""
+    count = chosen.shape[0]
+    return jnp.min(jnp.where(chosen < 0, jnp.arange(count)[:, None], count), axis=0)
+
+
+def _random_below(key: jax.Array, shape: tuple[int, ...], bound: jax.Array) -> jax.Array:
+    """int32 in `0..bound-1` for a traced bound below 2**16, uniform to within bound / 2**32.
+
+    The high word of `random_bits * bound`: unlike `jax.random.randint`, one draw and no division.
+    """
+    bits = jax.random.bits(key, shape, jnp.uint32)
+    bound = bound.astype(jnp.uint32)
+    low = ((bits & 0xFFFF) * bound) >> 16
+    return (((bits >> 16) * bound + low) >> 16).astype(jnp.int32)

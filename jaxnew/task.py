@@ -1,0 +1,136 @@
+"""A domain, composed in one place: environment, actions, play, presets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from jaxnew.actions import ActionSplit, ActionUniverse
+from jaxnew.environment import Environment
+from jaxnew.observations import RecordBlock, RecordingFormat
+from jaxnew.ppo import Hyperparameters, PPOConfig
+from jaxnew.representation.learner import Modality, RepresentationConfig
+
+
+@dataclass(frozen=True)
+class Play:
+    """How a domain's actions are recorded.
+
+    Attributes:
+      format: shape, dtype and bounds of one recording.
+      record_block: `(seed, ids int32[n], S) -> [n, S, *format.shape]`; see `observations.collect`.
+      block_actions: actions recorded per call.
+      modalities: how recordings become network inputs, by name; the first is the default.
+    """
+
+    format: RecordingFormat
+    record_block: RecordBlock
+    block_actions: int
+    modalities: Mapping[str, Modality]
+
+
+@dataclass(frozen=True)
+class StageOneBudget:
+    """How much is spent on a representation.
+
+    Attributes:
+      num_recordings: recordings per action to collect.
+      configs: hyper-parameters by kind, `hvae` and `vae`.
+      chunk_steps: gradient steps per compiled call.
+      checkpoint_every: gradient steps between checkpoints.
+      cost: what it takes; shown before it starts.
+    """
+
+    num_recordings: int
+    configs: Mapping[str, RepresentationConfig]
+    chunk_steps: int
+    checkpoint_every: int
+    cost: str
+
+
+@dataclass(frozen=True)
+class LoopConfig:
+    """The rhythm of policy training, in updates.
+
+    Attributes:
+      chunk_updates: updates per compiled call.
+      evaluate_every: updates between evaluations on train and validation sets.
+      evaluation_episodes: episodes per evaluation and split.
+      checkpoint_every: updates between `latest` checkpoints.
+    """
+
+    chunk_updates: int = 5
+    evaluate_every: int = 25
+    evaluation_episodes: int = 640
+    checkpoint_every: int = 50
+
+
+@dataclass(frozen=True)
+class StageTwoBudget:
+    """How much is spent on a policy.
+
+    Attributes:
+      num_updates: rollouts with their gradient steps.
+      ppo: shapes of the learner.
+      hyperparameters: its numbers.
+      loop: evaluations and checkpoints.
+      final_episodes: episodes per split of an evaluation after training.
+      cost: what it takes; shown before it starts.
+    """
+
+    num_updates: int
+    ppo: PPOConfig
+    hyperparameters: Hyperparameters
+    loop: LoopConfig
+    final_episodes: int
+    cost: str
+
+
+@dataclass(frozen=True)
+class Task:
+    """A domain. Modules in `experiments/tasks/` define one called `TASK`.
+
+    Attributes:
+      name: as in `--task`.
+      make_environment: the environment, made when first needed.
+      make_universe: all its actions.
+      splits: named ways to split the universe, each from a seed; the first is the default.
+      split_seed: seed of the splits; one for the project, so that all runs share them.
+      play: recordings of actions, or None for a domain whose representations are given.
+      stage_one, stage_two: presets by budget.
+      selection_metric: episode metric that checkpoints are selected by, on validation sets.
+      paper_environment: name of the domain in the paper's results, or None.
+      representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
+        representation should explain; for the report.
+    """
+
+    name: str
+    make_environment: Callable[[], Environment]
+    make_universe: Callable[[], ActionUniverse]
+    splits: Mapping[str, Callable[[ActionUniverse, int], ActionSplit]]
+    stage_two: Mapping[str, StageTwoBudget]
+    play: Play | None = None
+    stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
+    split_seed: int = 0
+    selection_metric: str = "is_success"
+    paper_environment: str | None = None
+    representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+
+    @property
+    def default_split(self) -> str:
+        return next(iter(self.splits))
+
+    def make_split(self, name: str, universe: ActionUniverse) -> ActionSplit:
+        """The split called `name`.
+
+        Raises:
+          ValueError: there is none of that name.
+        """
+        if name not in self.splits:
+            raise ValueError(
+                f"Task {self.name} has no split {name!r}; choose one of {sorted(self.splits)}."
+            )
+        return self.splits[name](universe, self.split_seed)

@@ -1,0 +1,440 @@
+"""The loop: a run killed anywhere and resumed equals one undisturbed run, bit for bit.
+
+Run as a script, `test_loop.py DIRECTORY`, it is the toy run that the tests kill.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+from flax import struct
+
+from jaxnew import loop, metrics
+from jaxnew.checkpoint import Checkpointer, CheckpointError
+from jaxnew.run_directory import RunDirectory
+
+ROOT = Path(__file__).resolve().parents[2]
+SETTINGS: dict[str, Any] = {
+    "total_steps": 47,
+    "chunk_steps": 5,
+    "checkpoint_every": 10,
+    "evaluate_every": 5,
+    "selection_metric": "validation/success",
+    "title": "toy",
+}
+OPTIMIZER = optax.adam(1e-2)
+TRACED: list[int] = []
+
+
+class Killed(BaseException):
+    """Stands for the end of the process."""
+
+
+@struct.dataclass
+class Toy:
+    step: jax.Array
+    key: jax.Array
+    params: jax.Array
+    opt_state: Any
+    num_episodes: jax.Array
+
+
+def init() -> Toy:
+    params = jnp.zeros(3)
+    return Toy(jnp.int32(0), jax.random.key(0), params, OPTIMIZER.init(params), jnp.asarray(0))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def chunk(state: Toy, n: int) -> tuple[Toy, dict[str, jax.Array]]:
+    TRACED.append(n)
+
+    def update(toy: Toy, _: None) -> tuple[Toy, jax.Array]:
+        noise = jax.random.normal(jax.random.fold_in(toy.key, toy.step), (3,))
+        change, opt_state = OPTIMIZER.update(toy.params - noise, toy.opt_state)
+        params = optax.apply_updates(toy.params, change)
+        return Toy(toy.step + 1, toy.key, params, opt_state, toy.num_episodes + 2), noise.sum()
+
+    state, losses = jax.lax.scan(update, state, None, length=n)
+    values = {"loss": losses.mean(), "nonfinite/loss": jnp.sum(~jnp.isfinite(losses))}
+    return state, {**values, "episode/return": jnp.nan, "episode/count": state.num_episodes}
+
+
+def evaluate(state: Toy) -> dict[str, float]:
+    # 0.2 at step 5, then higher each time until 1.0 at 35, 40, 45 and 47: the first must win.
+    return {"validation/success": float(np.round(np.sin(float(state.step) / 25), 1)), "other": 1.0}
+
+
+def train(path: Path, **changes: Any) -> loop.LoopResult[Toy]:
+    arguments = {**SETTINGS, "chunk": chunk, "evaluate": evaluate, **changes}
+    with RunDirectory.open_or_create(path, {"seed": 0}) as run_directory:
+        return loop.run(init(), run_directory=run_directory, **arguments)
+
+
+def reports(path: Path) -> list[dict[str, Any]]:
+    """The metrics without wall-clock fields."""
+    return [
+        {name: value for name, value in report.items() if not name.startswith("time/")}
+        for report in metrics.read(path)
+    ]
+
+
+def digest(state: Any) -> str:
+    leaves = [
+        np.asarray(jax.random.key_data(leaf) if leaf.dtype == init().key.dtype else leaf)
+        for leaf in jax.tree.leaves(state)
+    ]
+    return hashlib.sha256(b"".join(leaf.tobytes() for leaf in leaves)).hexdigest()
+
+
+def outcome(path: Path) -> dict[str, Any]:
+    """Everything that a finished run left behind and that must not depend on its history."""
+    checkpointer = Checkpointer(path / "checkpoints")
+    found: dict[str, Any] = {"metrics": reports(path)}
+    for kind in ("latest", "best"):
+        state, metadata = checkpointer.restore(kind, init())
+        metadata.pop("elapsed_s")
+        found[kind] = (int(state.step), digest(state), metadata)
+    return found
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
+    path = tmp_path_factory.mktemp("undisturbed")
+    result = train(path)
+    found = outcome(path)
+    assert found["latest"][1] == digest(result.state)
+    return found
+
+
+@pytest.mark.unit
+def test_an_undisturbed_run(tmp_path: Path) -> None:
+    TRACED.clear()
+    jax.clear_caches()
+    called: list[int] = []
+    result = train(tmp_path, on_evaluation=lambda step, state, found: called.append(step))
+    assert TRACED == [5, 2]
+    assert (result.step, result.was_interrupted, result.was_resumed) == (47, False, False)
+    evaluations = [r for r in reports(tmp_path) if "other" in r]
+    assert [r["step"] for r in evaluations] == [5, 10, 15, 20, 25, 30, 35, 40, 45, 47] == called
+    updates = [r for r in reports(tmp_path) if "loss" in r]
+    assert [r["step"] for r in updates] == [5, 10, 15, 20, 25, 30, 35, 40, 45, 47]
+    assert all(r["episode/return"] is None for r in updates)
+    assert (result.best_step, result.best_metric) == (35, 1.0)
+    assert result.last_evaluation == {"validation/success": 1.0, "other": 1.0}
+    checkpointer = Checkpointer(tmp_path / "checkpoints")
+    assert checkpointer.steps("best") == [25, 30, 35]
+    assert int(checkpointer.restore("best", init())[0].step) == 35
+    assert checkpointer.steps("latest") == [40, 47]
+    timed = metrics.read(tmp_path)[0]
+    assert timed["time/elapsed_s"] > 0
+    assert timed["time/steps_per_s"] > 0
+
+
+@pytest.mark.unit
+def test_a_complete_run_returns_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    first = train(tmp_path)
+    before = outcome(tmp_path)
+    capsys.readouterr()
+    again = train(tmp_path, chunk=None)
+    assert "already complete" in capsys.readouterr().out
+    assert again.was_resumed
+    assert digest(again.state) == digest(first.state)
+    assert (again.best_step, again.best_metric) == (first.best_step, first.best_metric)
+    assert outcome(tmp_path) == before
+
+
+@pytest.mark.unit
+def test_resuming_compiles_nothing_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    jax.clear_caches()
+    train(tmp_path, total_steps=20)
+    TRACED.clear()
+    result = train(tmp_path, total_steps=40)
+    assert "resuming" in capsys.readouterr().out
+    assert result.step == 40
+    assert TRACED == []
+
+
+class _Deaths:
+    """Kills the run at the n-th of the instants at which something reaches the disk."""
+
+    def __init__(self, patch: pytest.MonkeyPatch, at: int) -> None:
+        self.count, self._at = 0, at
+        for owner, name in (
+            (os, "rename"),
+            (os, "replace"),
+            (shutil, "rmtree"),
+            (metrics.MetricsLog, "write"),
+            (metrics.MetricsLog, "sync"),
+        ):
+            patch.setattr(owner, name, self._dying(getattr(owner, name)))
+
+    def _dying(self, real: Any) -> Any:
+        def function(*arguments: Any, **named: Any) -> Any:
+            self.count += 1
+            if self.count > self._at:
+                raise Killed
+            return real(*arguments, **named)
+
+        return function
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("seed", range(4))
+def test_killed_at_many_instants_and_resumed(
+    tmp_path: Path, undisturbed: dict[str, Any], seed: int
+) -> None:
+    rng = random.Random(seed)
+    num_kills = 0
+    for _ in range(60):
+        with pytest.MonkeyPatch.context() as patch:
+            deaths = _Deaths(patch, at=rng.randrange(1, 60))
+            try:
+                train(tmp_path)
+                break
+            except Killed:
+                num_kills += 1
+                assert deaths.count
+    train(tmp_path)
+    assert num_kills >= 1
+    assert outcome(tmp_path) == undisturbed
+
+
+@pytest.mark.integration
+def test_killed_between_best_and_latest(tmp_path: Path, undisturbed: dict[str, Any]) -> None:
+    """A `best` newer than the restored `latest` is dropped and made again, identically."""
+    real = Checkpointer.save
+
+    def save(self: Checkpointer, kind: Any, step: int, *rest: Any) -> Any:
+        if kind == "latest" and self.steps("best")[-1:] == [step] and step > 5:
+            raise Killed
+        return real(self, kind, step, *rest)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpointer, "save", save)
+        with pytest.raises(Killed):
+            train(tmp_path)
+    checkpointer = Checkpointer(tmp_path / "checkpoints")
+    assert checkpointer.steps("best")[-1] > checkpointer.steps("latest")[-1]
+    train(tmp_path)
+    assert outcome(tmp_path) == undisturbed
+
+
+@pytest.mark.integration
+def test_a_damaged_latest_costs_steps_but_not_exactness(
+    tmp_path: Path, undisturbed: dict[str, Any]
+) -> None:
+    train(tmp_path)
+    checkpointer = Checkpointer(tmp_path / "checkpoints")
+    newest = tmp_path / "checkpoints" / "latest" / f"{checkpointer.steps('latest')[-1]:012d}"
+    (newest / "record" / "metadata").write_text("{")
+    with pytest.warns(UserWarning, match="is damaged"):
+        result = train(tmp_path)
+    assert result.was_resumed
+    assert outcome(tmp_path) == undisturbed
+
+
+@pytest.mark.unit
+def test_unreadable_checkpoints_are_not_started_over(tmp_path: Path) -> None:
+    train(tmp_path, total_steps=5)
+    (tmp_path / "checkpoints/latest/000000000005/record/metadata").write_text("{")
+    before = reports(tmp_path)
+    with pytest.raises(CheckpointError, match="No readable checkpoint"):
+        train(tmp_path, total_steps=5)
+    assert reports(tmp_path) == before
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_finishes_the_chunk_saves_and_returns(
+    tmp_path: Path, undisturbed: dict[str, Any], number: signal.Signals
+) -> None:
+    def interrupted(state: Toy, n: int) -> Any:
+        if int(state.step) == 40:
+            os.kill(os.getpid(), number)
+        return chunk(state, n)
+
+    handler = signal.getsignal(number)
+    result = train(tmp_path, chunk=interrupted)
+    assert result.was_interrupted
+    assert signal.getsignal(number) is handler
+    # Not a multiple of checkpoint_every, nor a new best: saved because of the signal.
+    assert result.step == 45
+    assert Checkpointer(tmp_path / "checkpoints").steps("latest")[-1] == 45
+    assert train(tmp_path).was_resumed
+    assert outcome(tmp_path) == undisturbed
+
+
+@pytest.mark.unit
+def test_a_second_signal_stops_at_once(tmp_path: Path) -> None:
+    def stubborn(state: Toy, n: int) -> Any:
+        os.kill(os.getpid(), signal.SIGINT)
+        os.kill(os.getpid(), signal.SIGINT)
+        pytest.fail("the second signal was ignored")
+
+    with pytest.raises(KeyboardInterrupt):
+        train(tmp_path, chunk=stubborn)
+
+
+def _spoiled(name: str, value: float, at: int) -> Any:
+    def spoiled(state: Toy, n: int) -> Any:
+        state, values = chunk(state, n)
+        is_bad = int(state.step) == at
+        if is_bad:
+            state = state.replace(params=state.params * jnp.nan)
+        return state, {**values, name: value if is_bad else values.get(name, 0.0)}
+
+    return spoiled
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("name", "value", "text"),
+    [
+        ("loss", float("nan"), "loss is nan at step 20; the checkpoint of step 10 is good"),
+        ("loss", float("-inf"), "loss is -inf at step 20"),
+        ("nonfinite/gradient", 3.0, "nonfinite/gradient is 3.0 at step 20"),
+        ("nonfinite/gradient", float("nan"), "nonfinite/gradient is nan at step 20"),
+        # Nothing in the metrics tells of it: the parameters themselves are looked at.
+        ("episode/length", 1.0, "of the state is not finite at step 20"),
+    ],
+)
+def test_non_finite_numbers_stop_the_run(
+    tmp_path: Path, name: str, value: float, text: str
+) -> None:
+    with pytest.raises(loop.NonFiniteError, match=text):
+        train(
+            tmp_path,
+            chunk=_spoiled(name, value, 20),
+            evaluate=None,
+            evaluate_every=None,
+            selection_metric=None,
+        )
+    state, _ = Checkpointer(tmp_path / "checkpoints").restore("latest", init())
+    assert int(state.step) == 10
+    assert np.isfinite(np.asarray(state.params)).all()
+    train(tmp_path)
+    assert reports(tmp_path)[-1]["step"] == 47
+
+
+@pytest.mark.unit
+def test_a_bad_state_is_not_best_either(tmp_path: Path) -> None:
+    with pytest.raises(loop.NonFiniteError, match="of the state is not finite"):
+        train(tmp_path, chunk=_spoiled("episode/length", 1.0, 5))
+    assert Checkpointer(tmp_path / "checkpoints").steps("best") == []
+
+
+@pytest.mark.unit
+def test_metrics_that_may_be_nan_are_a_list(tmp_path: Path) -> None:
+    result = train(
+        tmp_path, chunk=_spoiled("x/y", float("nan"), -1), may_be_nan=["episode/*", "x/*"]
+    )
+    assert result.step == 47
+    with pytest.raises(loop.NonFiniteError, match="episode/return is nan"):
+        train(tmp_path / "other", may_be_nan=[])
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"chunk_steps": 0}, "chunk_steps must be at least 1, got 0"),
+        ({"evaluate_every": None}, "both evaluate and evaluate_every"),
+        ({"evaluate": None, "evaluate_every": None}, "needs evaluate"),
+        (
+            {"selection_metric": "test/x"},
+            "'test/x' is not in the evaluation, which has: other, valid",
+        ),
+        (
+            {"evaluate": lambda s: {"validation/success": np.zeros(3)}},
+            r"validation/success has shape \(3,\)",
+        ),
+        ({"chunk": lambda s, n: (s, {})}, "asked for 5 steps from 0 and ended at 0"),
+    ],
+)
+def test_wrong_arguments(tmp_path: Path, changes: dict[str, Any], text: str) -> None:
+    with pytest.raises(ValueError, match=text):
+        train(tmp_path, **changes)
+
+
+@pytest.mark.unit
+def test_a_run_past_its_end_or_open_for_reading_is_refused(tmp_path: Path) -> None:
+    train(tmp_path, total_steps=10)
+    with pytest.raises(ValueError, match="at step 10, past total_steps=5"):
+        train(tmp_path, total_steps=5)
+    with pytest.raises(ValueError, match="open for reading"):
+        loop.run(
+            init(),
+            run_directory=RunDirectory.load(tmp_path),
+            chunk=chunk,
+            total_steps=5,
+            chunk_steps=5,
+            checkpoint_every=5,
+            title="toy",
+        )
+
+
+@pytest.mark.unit
+def test_other_counters_and_states(tmp_path: Path) -> None:
+    with RunDirectory.open_or_create(tmp_path, {}) as run_directory:
+        result = loop.run(
+            {"n": 0, "x": np.zeros(2)},
+            chunk=lambda s, n: ({"n": s["n"] + n, "x": s["x"] + n}, {"loss": 1.0}),
+            run_directory=run_directory,
+            total_steps=7,
+            chunk_steps=3,
+            checkpoint_every=3,
+            title="counting",
+            step_of=lambda s: s["n"],
+            work_per_step=10,
+        )
+    assert result.state["n"] == 7
+    assert result.state["x"].tolist() == [7.0, 7.0]
+    assert (result.best_metric, result.last_evaluation) == (None, None)
+    assert metrics.read(tmp_path)[0]["time/work_per_s"] > 0
+
+
+@pytest.mark.integration
+def test_sigkilled_processes_resume_exactly(tmp_path: Path, undisturbed: dict[str, Any]) -> None:
+    rng = random.Random(0)
+    command = [sys.executable, __file__, str(tmp_path / "run")]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    num_kills = 0
+    for _ in range(3):
+        with subprocess.Popen(
+            command, env=environment, stdout=subprocess.PIPE, text=True
+        ) as process:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+            time.sleep(rng.uniform(0.2, 0.8))
+            if process.poll() is None:
+                process.kill()
+                num_kills += 1
+    subprocess.run(command, env=environment, check=True, timeout=100, stdout=subprocess.DEVNULL)
+    assert num_kills >= 1
+    assert outcome(tmp_path / "run") == undisturbed
+
+
+if __name__ == "__main__":
+    jax.block_until_ready(chunk(init(), 5))
+
+    def slowly(state: Toy, n: int) -> Any:
+        time.sleep(0.02)
+        return chunk(state, n)
+
+    print("ready", flush=True)
+    train(Path(sys.argv[1]), chunk=slowly)
