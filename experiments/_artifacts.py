@@ -90,7 +90,7 @@ def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
         legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in modalities]
         raise UsageError(
             f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}; engineered: "
-            f"{', '.join(domain.universe.engineered)}; or a run directory of embed, or an .npz file."
+            f"{', '.join(domain.universe.engineered)}; or an embed run, or an .npz file."
         )
     return kind, modalities[modality_name]
 

@@ -18,8 +18,8 @@ METHOD = flags.DEFINE_string("method", "ours", "Policy method.")
 REPRESENTATION = flags.DEFINE_string(
     "representation",
     "hvae",
-    "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot), a run "
-    "directory of embed, or an .npz table.",
+    "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot), a "
+    "run directory of embed, or an .npz table.",
 )
 SPLIT = flags.DEFINE_string("split", None, "Name of the split; default: the task's first.")
 BUDGET = flags.DEFINE_string("budget", "laptop", "smoke, laptop, paper (stage one also: fast).")

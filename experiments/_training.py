@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
-from experiments._flags import load_task
+from experiments._flags import budget_of, load_task
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit
@@ -136,7 +136,7 @@ class Trainer:
 
     def evaluate(self, state: TrainState) -> dict[str, float]:
         """Mean episode metrics on train and validation sets, from fixed keys."""
-        results = {}
+        results: dict[str, float] = {}
         for name in SPLITS_WATCHED:
             episodes = self.evaluator.run(
                 state.params,
@@ -154,23 +154,60 @@ class Trainer:
         return f"validation/{self.task.selection_metric}"
 
 
-def train(trainer: Trainer, run: RunDirectory, title: str) -> loop.LoopResult[TrainState]:
-    """Trains a policy in an open run directory, from where it stands to the end."""
-    config = trainer.config
-    return loop.run(
-        trainer.init(),
-        chunk=trainer.chunk,
-        evaluate=trainer.evaluate,
-        run_directory=run,
-        total_steps=config.num_updates,
-        chunk_steps=config.loop.chunk_updates,
-        evaluate_every=config.loop.evaluate_every,
-        checkpoint_every=config.loop.checkpoint_every,
-        selection_metric=trainer.selection_metric,
-        title=title,
-        work_per_step=config.ppo.steps_per_update,
-        shown_metrics=(f"episode/{trainer.task.selection_metric}", "policy/entropy"),
+def train_policy(
+    domain: Domain,
+    runs: Path,
+    table: RepresentationTable,
+    representation: str,
+    budget_name: str,
+    *,
+    method: str = "ours",
+    seed: int = 31,
+    assignments: list[str] | None = None,
+    workdir: Path | None = None,
+    overwrite: bool = False,
+) -> tuple[Path, loop.LoopResult[TrainState]]:
+    """Trains a policy in its run directory, from where it stands to the end.
+
+    Returns:
+      The run directory and how the run ended.
+    """
+    task = domain.task
+    budget: StageTwoBudget = budget_of(task.stage_two, budget_name, "Stage two")
+    config = config_lib.set_paths(
+        TrainConfig.of(domain, method, representation, table, budget, seed), assignments or []
     )
+    trainer = Trainer.of(config, task, domain.split, table)
+    name = f"{method}-{Path(representation).name.removesuffix('.npz')}"
+    path = workdir or domain.folder(runs) / f"{name}-{domain.split_name}-{budget_name}-{seed}"
+    with RunDirectory.open_or_create(
+        path,
+        config_lib.to_dict(config),
+        overwrite,
+        {"split_hash": domain.split.hash, "table_hash": table.hash, "table": table.source},
+    ) as run:
+        save_inputs(run, domain.split, table)
+        print(f"Training {name}: {config.num_updates} updates ({budget.cost}) in {path}.")
+        result = loop.run(
+            trainer.init(),
+            chunk=trainer.chunk,
+            evaluate=trainer.evaluate,
+            run_directory=run,
+            total_steps=config.num_updates,
+            chunk_steps=config.loop.chunk_updates,
+            evaluate_every=config.loop.evaluate_every,
+            checkpoint_every=config.loop.checkpoint_every,
+            selection_metric=trainer.selection_metric,
+            title=name,
+            work_per_step=config.ppo.steps_per_update,
+            shown_metrics=(f"episode/{task.selection_metric}", "policy/entropy"),
+        )
+    if result.best_metric is not None:
+        print(
+            f"{path}: update {result.step} of {config.num_updates}; best "
+            f"{trainer.selection_metric} {result.best_metric:.3f} at update {result.best_step}."
+        )
+    return path, result
 
 
 def save_inputs(run: RunDirectory, split: ActionSplit, table: RepresentationTable) -> None:

@@ -1,16 +1,18 @@
 """Records what every action does, in the play environment (resumable).
 
-    python -m experiments.collect --task=grid_world --budget=laptop
+python -m experiments.collect --task=grid_world --budget=laptop
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
+from absl import flags
+
 from experiments import _flags as flag
 from experiments._artifacts import Domain, collect_observations
 
-NUM_RECORDINGS = flag.flags.DEFINE_integer(
+NUM_RECORDINGS = flags.DEFINE_integer(
     "observations_per_action", None, "Recordings per action; default: what the budget says."
 )
 

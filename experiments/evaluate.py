@@ -1,9 +1,9 @@
 """Evaluates a trained policy on action sets, with no further training (paper algorithm 2).
 
-    python -m experiments.evaluate --run=RUN --sets=train,validation,test --episodes=5000
-    python -m experiments.evaluate --run=RUN --ids=ids.txt
-    python -m experiments.evaluate --run=RUN --table=new_table.npz
-    python -m experiments.evaluate --run=RUN --unseen_ratio=0.4
+python -m experiments.evaluate --run=RUN --sets=train,validation,test --episodes=5000
+python -m experiments.evaluate --run=RUN --ids=ids.txt
+python -m experiments.evaluate --run=RUN --table=new_table.npz
+python -m experiments.evaluate --run=RUN --unseen_ratio=0.4
 """
 
 from __future__ import annotations
@@ -43,21 +43,30 @@ def main() -> None:
     if RUN.value is None:
         raise flag.UsageError("Say which run to evaluate: --run=DIRECTORY.")
     path, kind = locate(Path(RUN.value))
+    kind = kind or CHECKPOINT.value
     run, trainer, split = load_trainer(path)
-    state, step = load_state(run, trainer, kind or CHECKPOINT.value)
     if SET_SIZE.value is not None:
         evaluator = dataclasses.replace(
             trainer.evaluator, set_size=SET_SIZE.value, padded_set_size=0
         )
         trainer = dataclasses.replace(trainer, evaluator=evaluator)
+    if TABLE.value is not None:
+        new = RepresentationTable.load(Path(TABLE.value))
+        trainer = dataclasses.replace(trainer, table=with_new_rows(trainer.table, new))
+    state, step = load_state(run, trainer, kind)
     rows = {}
     for name, ids in action_lists(trainer.task.make_universe(), split).items():
-        table = trainer.table
-        if TABLE.value is not None:
-            table = with_new_rows(table, RepresentationTable.load(Path(TABLE.value)))
-        rows[name] = evaluate_on(trainer, state, table, ids, split)
-        write(run, name, kind or CHECKPOINT.value, step, rows[name])
-    print_table(rows, f"{path}, {kind or CHECKPOINT.value} checkpoint (update {step})")
+        rows[name] = evaluate_on(
+            trainer,
+            state,
+            ids,
+            split,
+            num_episodes=EPISODES.value,
+            deterministic=DETERMINISTIC.value,
+            seed=EVALUATION_KEY.value,
+        )
+        record(run, name, kind, step, rows[name])
+    print_table(rows, f"{path}, {kind} checkpoint (update {step})")
 
 
 def locate(path: Path) -> tuple[Path, Any]:
@@ -103,31 +112,38 @@ def with_new_rows(table: jax.Array, new: RepresentationTable) -> jax.Array:
 
 
 def evaluate_on(
-    trainer: Trainer, state: TrainState, table: jax.Array, ids: np.ndarray, split: ActionSplit
+    trainer: Trainer,
+    state: TrainState,
+    ids: np.ndarray,
+    split: ActionSplit,
+    *,
+    num_episodes: int,
+    deterministic: bool = False,
+    seed: int = EVALUATION_SEED,
 ) -> dict[str, Any]:
     """Episodes on sets drawn from `ids`: metrics with intervals over episodes."""
     start = time.perf_counter()
     episodes = trainer.evaluator.run(
         state.params,
         state.rollout.observation_statistics,
-        table,
-        ActionPool.of(ids, capacity=len(table), always_available=split.always_available),
-        jax.random.key(EVALUATION_KEY.value),
-        EPISODES.value,
-        DETERMINISTIC.value,
+        trainer.table,
+        ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available),
+        jax.random.key(seed),
+        num_episodes,
+        deterministic,
     )
     return {
         "metrics": summarize(episodes),
-        "num_episodes": EPISODES.value,
+        "num_episodes": num_episodes,
         "num_actions": len(ids),
         "set_size": trainer.evaluator.set_size,
-        "policy": "greedy" if DETERMINISTIC.value else "sampled",
-        "evaluation_seed": EVALUATION_KEY.value,
+        "policy": "greedy" if deterministic else "sampled",
+        "evaluation_seed": seed,
         "seconds": round(time.perf_counter() - start, 2),
     }
 
 
-def write(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, Any]) -> None:
+def record(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, Any]) -> None:
     """Keeps one result in the run directory."""
     run.record_evaluation(
         f"{name}-{kind}-{row['policy']}-m{row['set_size']}",

@@ -1,4 +1,4 @@
-"""Trains many seeds and hyper-parameters as one vmapped program, sharded over the devices there are.
+"""Trains many seeds and hyper-parameters as one vmapped program, sharded over all devices.
 
     python -m experiments.sweep --representation=gt12 --seeds=31,41,51,61 \
         --vary=entropy_coefficient=0.01,0.05 --vary=learning_rate=3e-4,1e-3
@@ -119,7 +119,7 @@ class Sweep:
         key = jax.random.key(EVALUATION_SEED)
 
         def of_member(state: TrainState) -> dict[str, jax.Array]:
-            results = {}
+            results: dict[str, jax.Array] = {}
             for name in SPLITS_WATCHED:
 
                 def block(start: jax.Array, name: str = name) -> dict[str, jax.Array]:
@@ -150,14 +150,14 @@ class Sweep:
                 return jnp.where(is_better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
             best = jax.tree.map(pick, state.members, state.best)
-            return state.replace(best=best, best_metric=jnp.maximum(metric, state.best_metric))
+            return SweepState(state.members, best, jnp.maximum(metric, state.best_metric))
 
         return jax.jit(keep)
 
     def chunk(self, state: SweepState, num_updates: int) -> tuple[SweepState, dict[str, float]]:
         """Updates, and an evaluation where one is due; metrics are named `MEMBER/metric`."""
         members, metrics = self._updates(state.members, self.hyperparameters, n=num_updates)
-        state = state.replace(members=members)
+        state = replace(state, members=members)
         config = self.trainer.config
         is_last = state.step == config.num_updates
         if is_last or state.step % config.loop.evaluate_every == 0:
@@ -237,9 +237,13 @@ def member_configs(base: TrainConfig, seeds: list[int], vary: list[str]) -> list
         try:
             axes.append([(name, float(value)) for value in values.split(",")])
         except ValueError as err:
-            raise flag.UsageError(f"--vary={entry} must look like name=value,value: {err}.") from err
+            raise flag.UsageError(
+                f"--vary={entry} must look like name=value,value: {err}."
+            ) from err
         if name not in legal:
-            raise flag.UsageError(f"--vary={entry}: choose a hyper-parameter of {', '.join(legal)}.")
+            raise flag.UsageError(
+                f"--vary={entry}: choose a hyper-parameter of {', '.join(legal)}."
+            )
     # The members share the cache, so each gets a smaller share of it; the function is the same.
     combinations = list(itertools.product(*axes))
     num_members = len(combinations) * len(seeds)

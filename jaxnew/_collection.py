@@ -149,7 +149,7 @@ class _Collection:
                 progress.update(done + start + len(rows))
 
     def _forget_damaged(self) -> None:
-        """Makes the data file if it is absent or unusable; forgets actions that it does not hold."""
+        """Makes the data file if it is unusable; forgets the actions that it does not hold."""
         try:
             data = open_data(self._path, self._format, self._shape)
         except ObservationsError as err:

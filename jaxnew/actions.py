@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sized
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -59,7 +59,7 @@ class ActionUniverse:
     engineered: Mapping[str, np.ndarray] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        per_action = {
+        per_action: dict[str, Sized] = {
             "class_labels": self.class_labels,
             "primary_parameter": self.primary_parameter,
             "action_names": self.action_names,
@@ -187,9 +187,11 @@ class ActionSplit:
           SplitMismatch: the ids do not have the hash recorded beside them.
         """
         record = json.loads(path.read_text())
-        recorded_hash = record.pop("hash")
-        names = (*SPLIT_NAMES, "always_available")
-        split = cls(**{k: np.array(v, np.int32) if k in names else v for k, v in record.items()})
+        recorded_hash = record["hash"]
+        id_lists = {
+            name: np.array(record[name], np.int32) for name in (*SPLIT_NAMES, "always_available")
+        }
+        split = cls(universe_hash=record["universe_hash"], seed=record["seed"], **id_lists)
         if split.hash != recorded_hash:
             raise SplitMismatch(
                 f"{path} was edited or damaged: its ids hash to {split.hash}, it says "
@@ -204,7 +206,7 @@ def random_halves_split(universe: ActionUniverse, seed: int) -> ActionSplit:
     Actions with equal content are kept on one side, so the parts are disjoint by content.
     """
     rng = np.random.default_rng(seed)
-    keys = np.array([hash_id for hash_id in _group_by_content(universe)])
+    keys = np.array(_group_by_content(universe))
     groups = rng.permutation(len(np.unique(keys)))
     half, three_quarters = len(groups) // 2, len(groups) // 2 + len(groups) // 4
 

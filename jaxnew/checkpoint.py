@@ -40,7 +40,7 @@ def record_hash(record: Mapping[str, Any]) -> str:
     return hashlib.sha256(json.dumps(record, sort_keys=True).encode()).hexdigest()
 
 
-class _Damaged(Exception):
+class _DamagedError(Exception):
     """One checkpoint cannot be read; another may do."""
 
 
@@ -156,7 +156,7 @@ class Checkpointer:
             path = self._path(kind, candidate)
             try:
                 found = read(path)
-            except _Damaged as err:
+            except _DamagedError as err:
                 failures.append(f"{path} is damaged ({err})")
                 continue
             if failures:
@@ -174,18 +174,18 @@ class Checkpointer:
 
     def _read_record(self, path: Path) -> dict[str, Any]:
         if not path.is_dir():
-            raise _Damaged("it does not exist")
+            raise _DamagedError("it does not exist")
         try:
             args = ocp.args.Composite(record=ocp.args.JsonRestore())
             record = self._orbax.restore(path, args).record
             if record.pop("hash") != record_hash(record):
                 raise ValueError("its record is not what was saved")
         except Exception as err:  # Orbax and TensorStore raise many types for damaged files.
-            raise _Damaged(f"{type(err).__name__}: {str(err)[:200]}") from err
+            raise _DamagedError(f"{type(err).__name__}: {str(err)[:200]}") from err
         if record["format_version"] != _FORMAT_VERSION:
             raise CheckpointError(
-                f"{path} has format {record['format_version']}; this program reads {_FORMAT_VERSION}. Use the "
-                "version of the program that wrote it."
+                f"{path} has format {record['format_version']}; this program reads "
+                f"{_FORMAT_VERSION}. Use the version of the program that wrote it."
             )
         return cast(dict[str, Any], record)
 
@@ -200,9 +200,9 @@ class Checkpointer:
                 f"{path} does not fit this program: {difference}. Use the configuration and the "
                 "version of the program that wrote it."
             )
-        values = dict(zip((leaf["path"] for leaf in saved), self._read_values(path, saved)))
-        by_path = {leaf["path"]: leaf for leaf in saved}
-        restored = [_leaves.restore(values[name], by_path[name], leaf) for name, leaf in leaves]
+        pairs = zip(self._read_values(path, saved), saved, strict=True)
+        found = {description["path"]: (value, description) for value, description in pairs}
+        restored = [_leaves.restore(*found[name], leaf) for name, leaf in leaves]
         return jax.tree.unflatten(jax.tree.structure(example), restored), record["metadata"]
 
     def _read_values(self, path: Path, saved: list[_leaves.Leaf]) -> list[np.ndarray]:
@@ -214,12 +214,14 @@ class Checkpointer:
                 restore = ocp.args.PyTreeRestore(item=target, restore_args=kinds)
                 found = self._orbax.restore(path, ocp.args.Composite(state=restore)).state
             except Exception as err:  # As above.
-                raise _Damaged(f"{type(err).__name__}: {str(err)[:200]}") from err
+                raise _DamagedError(f"{type(err).__name__}: {str(err)[:200]}") from err
             for name, value in found.items():
                 values[int(name)] = np.asarray(value)
         for leaf, value in zip(saved, values, strict=True):
             if _leaves.sha256(value) != leaf["sha256"]:
-                raise _Damaged(f"the bytes of leaf {leaf['path']} are not those that were saved")
+                raise _DamagedError(
+                    f"the bytes of leaf {leaf['path']} are not those that were saved"
+                )
         return values
 
     def _folder(self, kind: Kind) -> Path:

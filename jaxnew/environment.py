@@ -44,7 +44,7 @@ class Action:
 
 @dataclass(frozen=True)
 class ActionSpec:
-    """Shape of the actions: ids `0..num_actions-1`, `position_dim` coordinates, a stop bit or not."""
+    """Shape of the actions: ids `0..num_actions-1`, `position_dim` coordinates, perhaps a stop."""
 
     num_actions: int
     position_dim: int = 0

@@ -7,7 +7,7 @@ runs at one width, so an episode is the same however many others are evaluated b
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -96,8 +96,9 @@ class Evaluator:
         """Episodes `start..start+width-1`, pure: f32[width] per metric. See `run`."""
         episodes = start + jnp.arange(self.width)
         keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(episodes)
-        available = draw_sets(keys[:, 0], pool, self.set_size, self.padded_set_size or None)
-        obs, state = jax.vmap(self.env.reset_env, in_axes=(0, None))(keys[:, 1], self.env_params)
+        keys_sets, keys_reset, keys_steps = keys[:, 0], keys[:, 1], keys[:, 2]
+        available = draw_sets(keys_sets, pool, self.set_size, self.padded_set_size or None)
+        obs, state = jax.vmap(self.env.reset_env, in_axes=(0, None))(keys_reset, self.env_params)
         projected = self.method.project(params, table)[available.ids]
 
         def step(carry: tuple[Any, ...], t: jax.Array) -> tuple[tuple[Any, ...], None]:
@@ -105,7 +106,7 @@ class Evaluator:
             if self.normalize_observations:
                 obs = statistics.normalize(obs)
             distribution = self.method.distribution(params, obs, projected, available.mask)
-            keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys[:, 2])
+            keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys_steps)
             if deterministic:
                 sample = distribution.mode()
             else:
@@ -133,11 +134,11 @@ class Evaluator:
 
     @cached_property
     def _play_sampled(self) -> Any:
-        return jax.jit(lambda *args: self.play_block(*args, deterministic=False))
+        return jax.jit(self.play_block)
 
     @cached_property
     def _play_greedy(self) -> Any:
-        return jax.jit(lambda *args: self.play_block(*args, deterministic=True))
+        return jax.jit(partial(self.play_block, deterministic=True))
 
 
 def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, float | str]]:

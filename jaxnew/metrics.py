@@ -92,7 +92,7 @@ class MetricsLog:
         content = self._path.read_bytes() if self._path.exists() else b""
         reports = _lines(self._path)
         kept = [report for report in reports if report["step"] <= step]
-        if len(kept) < len(reports) or not content.endswith(b"\n") and content:
+        if len(kept) < len(reports) or (content and not content.endswith(b"\n")):
             text = "".join(json.dumps(report) + "\n" for report in kept)
             write_bytes_atomically(self._path, text.encode())
         self._last_step = step

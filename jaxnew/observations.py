@@ -126,8 +126,8 @@ def load(path: Path | str, universe: ActionUniverse, verify: bool = True) -> Act
             problem = "has other bytes than were recorded"
         if problem is not None:
             raise ObservationsError(
-                f"{path}: the recording of action {ids[row]} {problem}. Run collect again to repair "
-                "it."
+                f"{path}: the recording of action {ids[row]} {problem}. Run collect again to "
+                "repair it."
             )
     return ActionObservations(data, ids, format, universe.hash, tuple(hashes))
 

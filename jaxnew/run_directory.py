@@ -296,9 +296,8 @@ def _replace(path: Path, config: dict[str, Any]) -> int:
         shutil.rmtree(_aside(path), ignore_errors=True)
         os.rename(path, _aside(path))
         try:
-            lock = _create(path, config)
+            return _create(path, config)
         finally:
             _restore_interrupted_overwrite(path)
     finally:
         os.close(old_lock)
-    return lock

@@ -126,7 +126,8 @@ def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
     and loops run over candidates: that is what the CPU vectorises.
     """
     key_pairs = jax.vmap(jax.random.split)(keys)
-    candidates = jax.vmap(lambda key: _random_below(key, (count,), pool.size))(key_pairs[:, 0]).T
+    keys_first, keys_refill = key_pairs[:, 0], key_pairs[:, 1]
+    candidates = jax.vmap(lambda key: _random_below(key, (count,), pool.size))(keys_first).T
     place = jnp.arange(count)[:, None]
 
     def mark_repeats(i: jax.Array, is_repeat: jax.Array) -> jax.Array:
@@ -136,7 +137,7 @@ def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
 
     def refill(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         chosen, iteration = carry
-        keys_now = jax.vmap(jax.random.fold_in, in_axes=(0, None))(key_pairs[:, 1], iteration)
+        keys_now = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys_refill, iteration)
         extra = jax.vmap(lambda key: _random_below(key, (_REFILL_BLOCK,), pool.size))(keys_now).T
 
         def fill_first_open(i: jax.Array, chosen: jax.Array) -> jax.Array:

@@ -84,28 +84,22 @@ def rollout_function(
             key_action, key_env = jax.random.split(key)
             action = sample_action(key_action, env)
             obs, next_state, reward, terminated, truncated, info = env.step(
-                key_env, state, action, params
+                jax.random.clone(key_env), state, action, params
             )
-            # The base class hands the first half of the key to the raw step.
+            # The base class hands the first half of the same key to the raw step.
             raw_obs = env.step_env(jax.random.split(key_env)[0], state, action, params)[0]
             final_obs = info.pop("final_observation")
-            record = dict(obs=obs, final_obs=final_obs, raw_obs=raw_obs, reward=reward)
-            record |= dict(terminated=terminated, truncated=truncated, info=info)
-            return next_state, record | dict(action=action, state=state)
+            record = {"obs": obs, "final_obs": final_obs, "raw_obs": raw_obs, "reward": reward}
+            record |= {"terminated": terminated, "truncated": truncated, "info": info}
+            return next_state, record | {"action": action, "state": state}
 
         def body(state: Any, key: jax.Array) -> tuple[Any, dict[str, Any]]:
             return jax.vmap(one)(jax.random.split(key, num_envs), state)
 
         _, record = jax.lax.scan(body, state, jax.random.split(key_scan, num_steps))
-        return jax.tree.map(_without_key_type, record | dict(first_obs=first_obs))
+        return record | {"first_obs": first_obs}
 
     return lambda key, params: Rollout(**jax.tree.map(np.asarray, run(key, params)))
-
-
-def _without_key_type(leaf: jax.Array) -> jax.Array:
-    """NumPy cannot hold PRNG keys, which a state may contain."""
-    is_key = jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
-    return jax.random.key_data(leaf) if is_key else leaf
 
 
 def record_rollout(
@@ -130,9 +124,9 @@ def check_traces_once(env: Environment, params: Any, other_params: Any, num_envs
 
     def step(key: jax.Array, state: Any, params: Any) -> Any:
         num_traces["step"] += 1
-        keys = jax.random.split(key, num_envs)
-        action = jax.vmap(sample_uniform, (0, None))(keys, env)
-        return jax.vmap(env.step, (0, 0, 0, None))(keys, state, action, params)
+        keys_action, keys_env = jax.random.split(key, (2, num_envs))
+        action = jax.vmap(sample_uniform, (0, None))(keys_action, env)
+        return jax.vmap(env.step, (0, 0, 0, None))(keys_env, state, action, params)
 
     jitted_reset, jitted_step = jax.jit(reset), jax.jit(step)
     for seed, episode_params in enumerate([params, params, other_params]):
@@ -279,15 +273,16 @@ def check_invalid_actions_counted(env: Environment, params: Any) -> None:
     """Ids outside the universe set `info["invalid_action"]`; the ids at its edges do not."""
     last = env.action_spec.num_actions - 1
     ids = jnp.array([-1, 0, last, last + 1, 2**31 - 1, -(2**31)], jnp.int32)
-    keys = jax.random.split(jax.random.key(0), len(ids))
-    action = jax.vmap(lambda key, i: sample_uniform(key, env).replace(id=i))(keys, ids)
 
     @jax.jit
-    def first_step(keys: jax.Array, action: Action) -> Any:
-        _, state = jax.vmap(env.reset, (0, None))(keys, params)
-        return jax.vmap(env.step, (0, 0, 0, None))(keys, state, action, params)
+    @jax.vmap
+    def first_step(key: jax.Array, action_id: jax.Array) -> Any:
+        key_action, key_reset, key_env = jax.random.split(key, 3)
+        action = sample_uniform(key_action, env).replace(id=action_id)
+        _, state = env.reset(key_reset, params)
+        return env.step(key_env, state, action, params)
 
-    obs, _, reward, *_, info = first_step(keys, action)
+    obs, _, reward, *_, info = first_step(jax.random.split(jax.random.key(0), len(ids)), ids)
     flags = info["invalid_action"].tolist()
     expected = [True, False, False, True, True, True]
     assert flags == expected, f"invalid_action of ids {ids.tolist()} is {flags}."
@@ -308,13 +303,12 @@ def check_fixed_action_set(env: Environment, params: Any, ids: np.ndarray) -> No
     assert bool(space.contains(space.sample(key_sample)))
     fixed_step, step = jax.jit(fixed.step), jax.jit(env.step)
     for index in (0, len(ids) - 1):
-        by_index = fixed_step(key, state, jnp.int32(index), params)
-        by_id = step(key, state, Action.of(int(ids[index])), params)
-        pairs = zip(jax.tree.leaves(by_index), jax.tree.leaves(by_id), strict=True)
-        for a, b in (map(_without_key_type, pair) for pair in pairs):
+        by_index = fixed_step(jax.random.clone(key), state, jnp.int32(index), params)
+        by_id = step(jax.random.clone(key), state, Action.of(int(ids[index])), params)
+        for a, b in zip(jax.tree.leaves(by_index), jax.tree.leaves(by_id), strict=True):
             assert np.array_equal(a, b), f"Index {index} did not do what id {ids[index]} does."
     for index in (-1, len(ids)):
-        info = fixed_step(key, state, jnp.int32(index), params)[-1]
+        info = fixed_step(jax.random.clone(key), state, jnp.int32(index), params)[-1]
         assert bool(info["invalid_action"]), f"Index {index} was accepted."
     for bad in ([], [-1], [env.action_spec.num_actions], [[0, 1]]):
         try:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from functools import lru_cache
 from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
+from PIL import Image, ImageDraw, ImageFont
 
 from envs_mjx.grid_world.environment import (
     FIRST_CELL,
@@ -18,11 +20,6 @@ from envs_mjx.grid_world.environment import (
     is_wall,
 )
 from envs_mjx.grid_world.skills import NUM_SKILLS, direction_of, moves_of, skill_name
-
-try:
-    from PIL import Image, ImageDraw, ImageFont
-except ImportError as err:
-    raise ImportError("Drawing needs Pillow: pip install pillow") from err
 
 Color = tuple[int, int, int]
 Path2D = Sequence[tuple[int, int]]
@@ -273,10 +270,10 @@ def _draw_path(draw: ImageDraw.ImageDraw, cells: Path2D, cell: int) -> None:
     Where a path goes back over its own track it keeps to the right, so that both ways are seen.
     Moves that a wall stopped leave no mark.
     """
-    walked = [cells[0]] + [b for a, b in zip(cells[:-1], cells[1:], strict=True) if a != b]
+    walked = [cells[0]] + [b for a, b in itertools.pairwise(cells) if a != b]
     corners = np.add(walked, 0.5) * cell
     directions = np.sign(np.diff(corners, axis=0))
-    tracks = [frozenset(track) for track in zip(walked[:-1], walked[1:], strict=True)]
+    tracks = [frozenset(track) for track in itertools.pairwise(walked)]
     returns = len(set(tracks)) < len(tracks)
     lane, width, head = (0.15, 0.08, 0.13) if returns else (0.0, 0.11, 0.17)
     lane *= cell

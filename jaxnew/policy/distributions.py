@@ -28,8 +28,8 @@ class Categorical:
     def sample(self, key: jax.Array) -> jax.Array:
         """int32[...] choices; consumes `key`.
 
-        One uniform number per choice and the inverse of the cumulative probability: the Gumbel trick
-        of `jax.random.categorical` draws m numbers and takes 2 m logarithms for each.
+        One uniform number per choice and the inverse of the cumulative probability: the Gumbel
+        trick of `jax.random.categorical` draws m numbers and takes 2 m logarithms for each.
         """
         cumulative = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
         total = cumulative[..., -1:]

@@ -25,7 +25,7 @@ class VectorEncoder(nn.Module):
 
 
 class VectorCritic(nn.Module):
-    """An encoder of its own and `dense 1`: f32[..., n] -> f32[...]. It never sees the action set."""
+    """An encoder of its own and `dense 1`: f32[..., n] -> f32[...]. Blind to the action set."""
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:

@@ -6,14 +6,14 @@ The utility of an action with representation `c` in a state with feature `f` is
     u = Lin(64, 1)( ReLU( Lin(128, 64)( [f, a] ) ) )
 
 and the policy is the softmax of the utilities of the available actions. The first 64 rows of the
-middle weight only ever meet `f` and the last 64 only `a`, so `[f, a] @ W = f @ W[:64] + a @ W[64:]`.
+middle weight only ever meet `f` and the last 64 only `a`: `[f, a] @ W = f @ W[:64] + a @ W[64:]`.
 The second term depends on the action alone: `project` computes it once for a whole table, and what
 is left per state and action is an addition, a ReLU and a dot product with 64 numbers.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -48,7 +48,7 @@ class Utility(nn.Module):
         return self.score(nn.relu(hidden))[..., 0]
 
     def concatenated(self, features: jax.Array, representations: jax.Array) -> jax.Array:
-        """The same utilities f32[..., m] as the paper writes them, from representations [..., m, d].
+        """The same utilities f32[..., m] as the paper writes them, from vectors f32[..., m, d].
 
         Kept as the reference for tests and benchmarks.
         """
@@ -84,7 +84,7 @@ class UtilityMethod:
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., 64]: all that the policy needs of an action, in any state."""
-        return self._utility.apply({"params": params["utility"]}, representations, method="project")
+        return self._apply(self._utility, params["utility"], representations, method="project")
 
     def distribution(
         self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
@@ -97,14 +97,18 @@ class UtilityMethod:
           projected: f32[..., m, 64] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
-        features = self._encoder.apply({"params": params["encoder"]}, obs)
-        utilities = self._utility.apply({"params": params["utility"]}, features, projected)
+        features = self._apply(self._encoder, params["encoder"], obs)
+        utilities = self._apply(self._utility, params["utility"], features, projected)
         return Categorical.masked(utilities, mask)
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[...] value of f32[..., n] normalised observations."""
-        return self._critic.apply({"params": params["critic"]}, obs)
+        return self._apply(self._critic, params["critic"], obs)
 
     def decode(self, sample: jax.Array, available: AvailableSet) -> Action:
         """The action behind a choice int32[...] from sets [..., m]."""
         return Action.of(jnp.take_along_axis(available.ids, sample[..., None], axis=-1)[..., 0])
+
+    @staticmethod
+    def _apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:
+        return cast(jax.Array, module.apply({"params": params}, *inputs, **options))

@@ -35,7 +35,9 @@ def gae(
     chex.assert_equal_shape([rewards, values, next_values, terminated, done])
     deltas = rewards + discount * next_values * ~terminated - values
 
-    def step(advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, ...]:
+    def step(
+        advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]
+    ) -> tuple[jax.Array, jax.Array]:
         delta, is_done = inputs
         advantage = delta + discount * lam * jnp.where(is_done, 0.0, advantage)
         return advantage, advantage

@@ -158,9 +158,7 @@ class Learner:
             key_learn, state.params, state.opt_state, batch, hyperparameters, table, state.step
         )
         metrics |= {f"episodes/{name}": value for name, value in sums.items()}
-        next_state = state.replace(
-            params=params, opt_state=opt_state, rollout=rollout, step=state.step + 1
-        )
+        next_state = TrainState(params, opt_state, rollout, state.key, state.step + 1)
         return next_state, metrics
 
     def updates(
@@ -220,7 +218,9 @@ class Learner:
             minibatch = jax.tree.map(lambda x: x[indices], transitions)
             grads, metrics = self._gradient(params, minibatch, hyperparameters, table)
             updates, opt_state = self.optimizer.update(grads, opt_state, params)
-            params = optax.apply_updates(params, jax.tree.map(lambda u: -learning_rate * u, updates))
+            params = optax.apply_updates(
+                params, jax.tree.map(lambda u: -learning_rate * u, updates)
+            )
             metrics["gradient_norm"] = optax.global_norm(grads)
             return (params, opt_state), metrics
 

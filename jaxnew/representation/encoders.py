@@ -78,7 +78,7 @@ class ResBlock(nn.Module):
 
 
 class ScalarBatchNorm(nn.Module):
-    """Batch norm with one feature: every number of the input shares one mean, variance, scale, shift.
+    """Batch norm with one feature: all numbers share one mean, variance, scale and shift.
 
     `BN1` of spec method 3.1: eps 1e-3, running averages keep 0.99. PyTorch feeds its running
     variance with the unbiased batch variance, this one (as Flax does) with the biased one; with

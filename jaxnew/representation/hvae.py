@@ -37,7 +37,7 @@ class ActionInference(nn.Module):
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
         """f32[B, S, E] -> (mean f32[B, dc], log-variance f32[B, dc]); blind to the order of S."""
         e = ResBlock(2)(nn.relu(Dense(self.width)(h)))
-        # Spec 3.3 has Lin, then the mean over S. The two commute, and the mean is the cheaper start.
+        # Spec 3.3 has Lin, then the mean over S. The two commute, and this order is cheaper.
         e = Dense(self.width)(jnp.mean(e, axis=1))
         e = Dense(2 * self.latent)(ResBlock(3)(e))
         mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2, axis=-1)
@@ -56,9 +56,7 @@ class ObservationInference(nn.Module):
     latent: int
 
     @nn.compact
-    def __call__(
-        self, h: jax.Array, c: jax.Array, training: bool
-    ) -> tuple[jax.Array, jax.Array]:
+    def __call__(self, h: jax.Array, c: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
         """(f32[B, S, E], f32[B, dc]) -> (mean f32[B, S, dz], log-variance f32[dz])."""
         from_recording = Dense(self.width, name="from_recording")(h)
         from_action = Dense(self.width, name="from_action")(c)

@@ -50,6 +50,7 @@ class RepresentationConfig:
       gradient_clip: every gradient entry is clamped to +- this.
 
     Raises:
+      TypeError: a count is not an integer.
       ValueError: a field is out of its range.
     """
 
@@ -73,7 +74,7 @@ class RepresentationConfig:
             if isinstance(field.default, str):
                 continue
             if isinstance(field.default, int) and not isinstance(value, int):
-                raise ValueError(f"{field.name}={value!r} must be an integer.")
+                raise TypeError(f"{field.name}={value!r} must be an integer.")
             if not value > 0:
                 raise ValueError(f"{field.name}={value!r} must be positive.")
 
@@ -113,7 +114,7 @@ class RepresentationLearner:
         self.config = config
         self.modality = modality
         self._model = _build_model(config, modality)
-        # Spec method 3.7: elementwise clamp, then RAdam (threshold 5, betas 0.9 and 0.999, eps 1e-8).
+        # Spec method 3.7: elementwise clamp, then RAdam with betas 0.9 and 0.999, eps 1e-8.
         self._optimizer = optax.chain(
             optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
         )
@@ -362,7 +363,9 @@ def _build_model(config: RepresentationConfig, modality: Modality) -> HVAE | Fla
     )
 
 
-def _padded_chunks(recordings: jax.Array | np.ndarray, batch: int) -> Iterator[np.ndarray]:
+def _padded_chunks(
+    recordings: jax.Array | np.ndarray, batch: int
+) -> Iterator[jax.Array | np.ndarray]:
     """Chunks [batch, S, T, D0] of all actions; the last repeats its last action up to `batch`.
 
     Equal shapes, so that one program encodes them all.

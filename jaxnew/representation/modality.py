@@ -41,7 +41,9 @@ class Modality:
                 f"{GAUSSIAN!r} or {CATEGORICAL!r}."
             )
         if self.feature_dim < 1:
-            raise ValueError(f"Modality {self.name!r}: feature_dim={self.feature_dim} must be >= 1.")
+            raise ValueError(
+                f"Modality {self.name!r}: feature_dim={self.feature_dim} must be >= 1."
+            )
         is_categorical = self.likelihood == CATEGORICAL
         if is_categorical != (self.num_categories > 0):
             raise ValueError(

@@ -153,15 +153,14 @@ def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> E
     Args:
       output: of the model's forward pass on `features`.
       features: f32[B, S, T, D]; step 0 is given to the decoder and not scored.
-      num_categories: 0 for a Gaussian likelihood, else categories per coordinate.
+      num_categories: categories per coordinate; not read for a Gaussian likelihood.
     """
     target = features[:, :, 1:]
-    if num_categories:
+    log_variance = output.likelihood_log_variance
+    if log_variance is None:
         log_likelihood = categorical_log_likelihood(target, output.prediction, num_categories)
     else:
-        log_likelihood = gaussian_log_likelihood(
-            target, output.prediction, output.likelihood_log_variance
-        )
+        log_likelihood = gaussian_log_likelihood(target, output.prediction, log_variance)
     kl_observation = gaussian_kl(
         output.observation_mean,
         output.observation_log_variance,
@@ -169,7 +168,7 @@ def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> E
         output.prior_log_variance,
     )
     kl_action = jnp.zeros(())
-    if output.action_mean is not None:
+    if output.action_mean is not None and output.action_log_variance is not None:
         kl_action = jnp.sum(gaussian_kl(output.action_mean, output.action_log_variance))
     num_recordings = features.shape[0] * features.shape[1]
     return ElboTerms(

@@ -1,21 +1,211 @@
-"""Temporary: replaced by the table of stage 1."""
+"""The representation table: what a policy knows about each action. NumPy only."""
+
 from __future__ import annotations
+
+import io
+import zipfile
+import zlib
 from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
 import numpy as np
-from jaxnew.actions import content_hash
-@dataclass(frozen=True)
+
+from jaxnew._files import write_bytes_atomically
+from jaxnew.actions import ActionSplit, ActionUniverse, SplitMismatch, content_hash
+
+_TEXTS = ("universe_hash", "split_hash", "source", "hash")
+
+# All that `numpy.load` was seen to raise on missing, cut or foreign files.
+_UNREADABLE = (
+    OSError,
+    ValueError,
+    EOFError,
+    AttributeError,
+    TypeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
+
+
+@dataclass(frozen=True, eq=False)
 class RepresentationTable:
+    """One vector per action.
+
+    Attributes:
+      vectors: f32[A, d] finite; row i describes action `ids[i]`.
+      ids: int32[A] ascending, each once. Rows given in another order are sorted.
+      universe_hash: `ActionUniverse.hash` of the actions, None if unknown.
+      split_hash: `ActionSplit.hash` of the split whose train actions the encoder learned from;
+        None if unknown, or if nothing was learned (engineered vectors).
+      source: where the vectors come from, e.g. "hvae-xy, laptop, seed 31".
+
+    Raises:
+      ValueError: a shape, an id or a value is wrong.
+    """
+
     vectors: np.ndarray
     ids: np.ndarray
-    universe_hash: str|None
-    split_hash: str|None
-    source: str
+    universe_hash: str | None = None
+    split_hash: str | None = None
+    source: str = "unknown"
+
+    def __post_init__(self) -> None:
+        vectors = _checked_vectors(np.asarray(self.vectors))
+        ids = _checked_ids(np.asarray(self.ids), len(vectors))
+        order = np.argsort(ids)
+        object.__setattr__(self, "vectors", np.ascontiguousarray(vectors[order]))
+        object.__setattr__(self, "ids", ids[order])
+
     @property
-    def hash(self): return content_hash(np.asarray(self.vectors), np.asarray(self.ids))
-    def rows(self, ids): return self.vectors[np.searchsorted(self.ids, ids)]
-    def save(self, path): np.savez(path, vectors=self.vectors, ids=self.ids)
+    def hash(self) -> str:
+        """Identifies what a policy reads: ids and vectors, not where they come from."""
+        return content_hash(self.vectors, self.ids)
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """f32[n, d] vectors of the actions `ids` int[n].
+
+        Raises:
+          ValueError: the table lacks one of them.
+        """
+        ids = np.asarray(ids)
+        missing = np.setdiff1d(ids, self.ids)
+        if missing.size:
+            raise ValueError(
+                f"The table ({self.source}) lacks {missing.size} of the {len(np.unique(ids))} "
+                f"actions asked for, the first is {missing[0]}. Encode these actions too."
+            )
+        return self.vectors[np.searchsorted(self.ids, ids)]
+
+    def check(self, universe: ActionUniverse, split: ActionSplit) -> None:
+        """Raises unless the table describes every action of `universe` and fits `split`.
+
+        Unknown hashes (None) fit everything: a user's own vectors carry none.
+
+        Raises:
+          SplitMismatch: the table was made for another universe or split.
+          ValueError: it lacks an action, or has one that does not exist.
+        """
+        if self.universe_hash not in (None, universe.hash):
+            raise SplitMismatch(
+                f"The table ({self.source}) describes universe {self.universe_hash}, but "
+                f"{universe.name} is {universe.hash}. Make the table again for this universe."
+            )
+        if self.split_hash not in (None, split.hash):
+            raise SplitMismatch(
+                f"The table ({self.source}) was learned on split {self.split_hash}, but the split "
+                f"in use is {split.hash}; its test actions may have been seen in training. Train "
+                "the encoder on this split, or use the split that the table was learned on."
+            )
+        self.rows(np.arange(universe.num_actions))
+        if len(self.ids) > universe.num_actions:
+            unknown = self.ids[(self.ids < 0) | (self.ids >= universe.num_actions)]
+            raise ValueError(
+                f"The table ({self.source}) describes action {unknown[0]}; {universe.name} has "
+                f"0..{universe.num_actions - 1}."
+            )
+
+    def save(self, path: Path | str) -> None:
+        """Writes `path` (.npz), whole or not at all."""
+        texts = {name: getattr(self, name) for name in _TEXTS}
+        arrays: dict[str, Any] = {"vectors": self.vectors, "ids": self.ids}
+        arrays |= {name: np.array(text) for name, text in texts.items() if text is not None}
+        buffer = io.BytesIO()
+        np.savez(buffer, **arrays)
+        write_bytes_atomically(Path(path), buffer.getvalue())
+
     @classmethod
-    def load(cls, path): raise NotImplementedError
-    def check(self, universe, split): pass
-def engineered_table(universe, name):
-    return RepresentationTable(universe.engineered[name], np.arange(universe.num_actions,dtype=np.int32), universe.hash, None, name)
+    def load(cls, path: Path | str) -> RepresentationTable:
+        """Reads what `save` wrote, or a user's own `.npz` with the arrays `ids` and `vectors`.
+
+        The hashes of a user's own file are unknown (None); `source` is then its path.
+
+        Raises:
+          ValueError: the file is missing or damaged, or its arrays are wrong.
+        """
+        arrays = _read_npz(Path(path))
+        texts = {name: str(arrays[name]) for name in _TEXTS if name in arrays}
+        try:
+            table = cls(
+                vectors=arrays["vectors"],
+                ids=arrays["ids"],
+                universe_hash=texts.get("universe_hash"),
+                split_hash=texts.get("split_hash"),
+                source=texts.get("source", str(path)),
+            )
+        except ValueError as err:
+            raise ValueError(f"{path}: {err}") from err
+        if texts.get("hash", table.hash) != table.hash:
+            raise ValueError(
+                f"{path} was edited or damaged: its rows hash to {table.hash}, it says "
+                f"{texts['hash']}. Restore the file or make the table again."
+            )
+        return table
+
+
+def engineered_table(universe: ActionUniverse, name: str) -> RepresentationTable:
+    """The table of the universe's ground-truth vectors called `name`.
+
+    Raises:
+      ValueError: the universe has no such vectors.
+    """
+    if name not in universe.engineered:
+        raise ValueError(
+            f"{universe.name} has no engineered vectors {name!r}; it has "
+            f"{sorted(universe.engineered)}."
+        )
+    return RepresentationTable(
+        vectors=universe.engineered[name],
+        ids=np.arange(universe.num_actions, dtype=np.int32),
+        universe_hash=universe.hash,
+        source=f"engineered:{name}",
+    )
+
+
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file that has at least `ids` and `vectors`."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+    except _UNREADABLE as err:
+        raise ValueError(
+            f"{path} is missing or damaged ({err}); it must be an .npz file with the arrays `ids` "
+            "and `vectors`."
+        ) from err
+    for name in ("ids", "vectors"):
+        if name not in arrays:
+            raise ValueError(f"{path} lacks the array {name!r}; it has {sorted(arrays)}.")
+    return arrays
+
+
+def _checked_vectors(vectors: np.ndarray) -> np.ndarray:
+    """`vectors` as f32[A, d]."""
+    if vectors.ndim != 2 or 0 in vectors.shape or vectors.dtype.kind not in "fiu":
+        raise ValueError(
+            f"vectors must be numbers [A, d], one row per action; got {vectors.dtype} of shape "
+            f"{vectors.shape}."
+        )
+    with np.errstate(over="ignore"):
+        vectors = vectors.astype(np.float32)
+    bad_rows = np.flatnonzero(~np.isfinite(vectors).all(axis=1))
+    if bad_rows.size:
+        raise ValueError(
+            f"vectors holds NaN or infinite numbers in {bad_rows.size} of {len(vectors)} rows, the "
+            f"first is row {bad_rows[0]}. A diverged encoder gives such rows."
+        )
+    return vectors
+
+
+def _checked_ids(ids: np.ndarray, num_rows: int) -> np.ndarray:
+    """`ids` as int32[num_rows], each once and not negative."""
+    if ids.shape != (num_rows,) or ids.dtype.kind not in "iu":
+        raise ValueError(
+            f"ids must be {num_rows} integers, one per row of vectors; got {ids.dtype} of shape "
+            f"{ids.shape}."
+        )
+    if ids.min() < 0 or ids.max() > np.iinfo(np.int32).max:
+        raise ValueError(f"ids span {ids.min()}..{ids.max()}; an action id is a small number >= 0.")
+    values, counts = np.unique(ids, return_counts=True)
+    if len(values) != num_rows:
+        raise ValueError(f"ids names action {values[counts > 1][0]} twice; list each id once.")
+    return ids.astype(np.int32)

@@ -68,9 +68,7 @@ class FlatVAE(nn.Module):
         """
         mean, log_variance = self.inference(self.encoder(features), training)
         z = sample_gaussian(mean, log_variance, noise.observation)
-        prediction = self.decoder(
-            self.decoder_start(z, None), features[:, :, 0], features.shape[2]
-        )
+        prediction = self.decoder(self.decoder_start(z, None), features[:, :, 0], features.shape[2])
         return VAEOutput(
             action_mean=None,
             action_log_variance=None,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import jax
@@ -103,7 +103,7 @@ class DeviceRollout:
         params: Any,
         table: jax.Array,
         pool: ActionPool,
-        discount: jax.Array,
+        discount: jax.Array | float,
     ) -> tuple[RolloutState, RolloutBatch, dict[str, jax.Array]]:
         """`num_steps` steps of every environment.
 
@@ -128,13 +128,15 @@ class DeviceRollout:
         keys = (jax.random.split(key_samples, shape[0]), jax.random.split(key_envs, shape))
         projected_table = self.method.project(params, table)
 
-        def step(state: RolloutState, inputs: tuple[Any, AvailableSet]) -> tuple[Any, ...]:
+        def step(
+            state: RolloutState, inputs: tuple[tuple[jax.Array, jax.Array], AvailableSet]
+        ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
             return self._step(inputs[0], state, params, projected_table, inputs[1], discount)
 
         state, (batch, final_values, info) = jax.lax.scan(step, state, (keys, next_sets))
         last_value = self.method.value(params, state.observation)
         next_value = jnp.concatenate([batch.value[1:], last_value[None]])
-        batch = batch.replace(next_value=jnp.where(batch.done, final_values, next_value))
+        batch = replace(batch, next_value=jnp.where(batch.done, final_values, next_value))
         sums = {
             name: jnp.sum(jnp.where(batch.done, info[name], 0.0))
             for name in self.env.episode_metrics
@@ -148,7 +150,7 @@ class DeviceRollout:
         params: Any,
         projected_table: jax.Array,
         next_set: AvailableSet,
-        discount: jax.Array,
+        discount: jax.Array | float,
     ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
         key_sample, keys_env = keys
         distribution = self.method.distribution(
@@ -214,7 +216,7 @@ class DeviceRollout:
         return statistics.normalize(raw_obs) if self.config.normalize_observations else raw_obs
 
     def _scale_reward(
-        self, reward: jax.Array, state: RolloutState, done: jax.Array, discount: jax.Array
+        self, reward: jax.Array, state: RolloutState, done: jax.Array, discount: jax.Array | float
     ) -> tuple[jax.Array, jax.Array, RunningStatistics]:
         """Spec method 5.1: rewards over the running deviation of the discounted return."""
         discounted_return = discount * state.discounted_return + reward

@@ -26,11 +26,10 @@ pytestmark = pytest.mark.contract
 
 @struct.dataclass
 class EndsState:
-    """count int32[] steps so far; noise f32[] drawn at the reset; key: unused, of its own type."""
+    """count int32[] steps so far; noise f32[] drawn at the reset."""
 
     count: jax.Array
     noise: jax.Array
-    key: jax.Array
 
 
 @struct.dataclass
@@ -59,8 +58,7 @@ class Ends(Environment[EndsState, EndsParams]):
         return ObservationSpec((2,), jnp.float32, 0.0, 100.0)
 
     def reset_env(self, key: jax.Array, params: EndsParams) -> tuple[jax.Array, EndsState]:
-        key_noise, key_state = jax.random.split(key)
-        state = EndsState(jnp.int32(0), jax.random.uniform(key_noise), key_state)
+        state = EndsState(jnp.int32(0), jax.random.uniform(key))
         return self._observe(state, params), state
 
     def step_env(
@@ -92,7 +90,7 @@ def test_all_four_flag_combinations(terminated: bool, truncated: bool) -> None:
         assert obs[0] == 0
         assert obs[1] != first_obs[1]
         assert state.count == expected_state.count
-        assert bool(state.key == expected_state.key)
+        assert state.noise == expected_state.noise
     else:
         assert np.array_equal(obs, info["final_observation"])
         assert state.count == 1

@@ -15,13 +15,13 @@ pytestmark = pytest.mark.contract
 
 ENV = GridWorld()
 PARAMS = ENV.default_params
-# Another legal value for each field; the layout is a vertical river at x = 4.
+# Another legal value for each field.
 CHANGES = {
     "max_moves": 20,
     "subgoal_reward": 0.25,
     "goal_reward": 2.0,
     "time_penalty": 0.5,
-    "fixed_layout": 10,
+    "fixed_layout": 10,  # V4/4
 }
 
 
@@ -92,13 +92,25 @@ def test_each_parameter_matters(run) -> None:
     contract.check_parameters_matter(run, PARAMS, CHANGES)
 
 
-def test_fixed_layout_is_clipped(run) -> None:
-    def layouts(fixed_layout: int) -> set[int]:
+def test_parameters_enter_the_reward_as_documented() -> None:
+    """V4/4, skills 21, 320, 1012: the goal on move 12 of 20."""
+    params = PARAMS.replace(**CHANGES)
+    _, state = ENV.reset(jax.random.key(0), params)
+    step_env, rewards = jax.jit(ENV.step_env), []
+    for skill in (21, 320, 1012):
+        _, state, reward, *_ = step_env(jax.random.key(0), state, Action.of(skill), params)
+        rewards.append(float(reward))
+    # 2.0 - 0.5 * 12 / 20 = 1.7; float32.
+    np.testing.assert_allclose(rewards, [0.0, 0.25, 1.7], atol=1e-6, rtol=0)
+
+
+def test_fixed_layout_is_clipped() -> None:
+    def layout(fixed_layout: int) -> int:
         state = ENV.reset(jax.random.key(0), PARAMS.replace(fixed_layout=fixed_layout))[1]
         return int(state.layout)
 
-    assert [layouts(i) for i in (0, 41, 42, 1000)] == [0, 41, 41, 41]
-    assert layouts(-5) == layouts(-1)
+    assert [layout(i) for i in (0, 41, 42, 1000)] == [0, 41, 41, 41]
+    assert layout(-5) == layout(-1)
 
 
 def test_fixed_action_set() -> None:
@@ -148,10 +160,11 @@ def test_step_is_the_raw_step_with_a_reset_from_its_key() -> None:
     @jax.jit
     @jax.vmap
     def both(key: jax.Array, action_id: jax.Array) -> tuple:
-        _, state = ENV.reset(key, PARAMS)
-        key = jax.random.fold_in(key, 1)
+        key_start, key = jax.random.split(key)
+        _, state = ENV.reset(key_start, PARAMS)
         raw = ENV.step_env(key, state, Action.of(action_id), PARAMS)
-        return raw, ENV.reset_env(key, PARAMS), ENV.step(key, state, Action.of(action_id), PARAMS)
+        first = ENV.reset_env(jax.random.clone(key), PARAMS)
+        return raw, first, ENV.step(key, state, Action.of(action_id), PARAMS)
 
     raw, first, stepped = jax.device_get(both(keys, ids))
     done = raw[3] | raw[4]

@@ -8,14 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from PIL import Image
 
-from envs_mjx.grid_world import GridWorld, GridWorldState
+from envs_mjx.grid_world import GridWorld, GridWorldState, drawing
 from envs_mjx.grid_world.environment import encode_layout
 from jaxnew.environment import Action
-
-Image = pytest.importorskip("PIL.Image", reason="drawing needs Pillow")
-
-from envs_mjx.grid_world import drawing  # noqa: E402 (needs Pillow)
 
 pytestmark = pytest.mark.unit
 

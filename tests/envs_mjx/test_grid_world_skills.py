@@ -97,5 +97,5 @@ def test_universe() -> None:
 
 def test_skill_name_refuses_other_ids() -> None:
     for bad in (-1, 1024):
-        with pytest.raises(ValueError, match="ids are 0..1023"):
+        with pytest.raises(ValueError, match=r"ids are 0\.\.1023"):
             skill_name(bad)

@@ -326,3 +326,23 @@ def test_a_save_killed_at_any_rename_or_deletion_leaves_the_newest_readable(
             assert call > 4  # Every instant was tried.
             return
     pytest.fail("40 calls were not enough")
+
+
+@pytest.mark.unit
+def test_a_half_deleted_checkpoint_no_longer_counts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def half(path: Path, **named: Any) -> None:
+        (path / "record" / "metadata").unlink()
+        raise Killed
+
+    checkpointer = Checkpointer(tmp_path)
+    for step in (1, 2):
+        checkpointer.save("latest", step, {"a": jnp.float32(step)})
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", half)
+        with pytest.raises(Killed):
+            checkpointer.save("latest", 3, {"a": jnp.float32(3)})
+    assert checkpointer.steps("latest") == [2, 3]
+    checkpointer.save("latest", 4, {"a": jnp.float32(4)})
+    assert sorted(os.listdir(tmp_path / "latest")) == ["000000000003", "000000000004"]

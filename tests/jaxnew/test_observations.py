@@ -150,9 +150,14 @@ def test_killed_at_every_instant_and_resumed(tmp_path: Path) -> None:
                 gather(path, dies(record), block_actions=8)
             except Killed:
                 is_killed = True
-        if is_killed:
+        # At the very last instants everything is there, though collect did not return.
+        is_complete = path.exists() and "null" not in _text(path / "manifest.json")
+        if not is_complete:
             with pytest.raises(ObservationsError, match=r"unfinished|no manifest"):
                 load(path, make_universe())
+        else:
+            load(path, make_universe())
+        assert is_complete or is_killed
         gather(path, block_actions=3)
         assert contents(path) == contents(tmp_path / "whole")
         shutil.rmtree(path)
@@ -189,6 +194,10 @@ def test_a_sigkilled_process_is_continued(tmp_path: Path) -> None:
     assert num_kills >= 1
     assert len(recorded) < NUM_ACTIONS  # What was finished is kept.
     assert contents(tmp_path / "killed") == contents(tmp_path / "whole")
+
+
+def _text(path: Path) -> str:
+    return path.read_text() if path.exists() else "null"
 
 
 def flip(path: Path, position: int) -> None:

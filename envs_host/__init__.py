@@ -1,0 +1,1 @@
+"""Simulators that run in worker processes. Nothing in here imports jax."""

@@ -1,0 +1,201 @@
+"""Learning curves, as a pure function from numbers to a matplotlib `Figure`."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.legend_handler import HandlerTuple
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
+
+from experiments._paper import PaperCurve
+from experiments._plots import (
+    INK,
+    LEGEND,
+    PAPER_COLOR,
+    Color,
+    Metric,
+    new_figure,
+    set_title,
+    tidy,
+)
+
+_PAPER_DASHES = ((0, (5, 2)), (0, (1, 1)), (0, (5, 1.5, 1, 1.5)))
+_LONG_LABEL = 62  # Characters; two such columns of a legend are as wide as the figure.
+
+
+@dataclass(frozen=True)
+class RunCurve:
+    """A metric of one run: environment steps f64[n], ascending, and values f64[n]."""
+
+    steps: np.ndarray
+    values: np.ndarray
+
+    def held_at_best(self) -> RunCurve:
+        """The curve up to its first maximum, and that maximum from there on (spec method 11)."""
+        best = int(np.argmax(self.values)) if len(self.values) else 0
+        is_after = np.arange(len(self.values)) > best
+        return RunCurve(self.steps, np.where(is_after, self.values[best : best + 1], self.values))
+
+
+@dataclass(frozen=True)
+class CurveSetting:
+    """The curves of one setting.
+
+    Attributes:
+      label: of the setting.
+      color: of our curves.
+      runs: by split, one curve per seed.
+      paper: by split; a split may be absent.
+      paper_label: of the paper's curves.
+    """
+
+    label: str
+    color: Color
+    runs: Mapping[str, Sequence[RunCurve]]
+    paper: Mapping[str, PaperCurve] = field(default_factory=dict)
+    paper_label: str = "paper"
+
+
+def mean_curve(runs: Sequence[RunCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Steps that all runs have, and there the mean and population deviation over the runs."""
+    common = runs[0].steps
+    for run in runs[1:]:
+        common = np.intersect1d(common, run.steps)
+    values = np.array([run.values[np.isin(run.steps, common)] for run in runs])
+    return common, values.mean(axis=0), values.std(axis=0)
+
+
+def learning_curves(
+    settings: Sequence[CurveSetting],
+    metric: Metric,
+    splits: Sequence[str] = ("train", "validation"),
+    title: str = "",
+) -> Figure:
+    """A metric against environment steps, one panel per split.
+
+    Faint lines are the evaluations of each run. Strong lines are drawn as the paper draws its own:
+    every run held at its best evaluation, then the mean and, for several runs, the deviation. The
+    axis ends where our longest run ends; a dotted line tells where the paper's curve goes to.
+
+    Args:
+      settings: at least one.
+      metric: of the vertical axis.
+      splits: panels from left to right.
+      title: of the figure.
+    """
+    handles, labels = _curve_legend(settings)
+    num_columns = 2 if max(map(len, labels)) <= _LONG_LABEL else 1
+    num_rows = -(-len(labels) // num_columns)
+    figure = new_figure(4.6 * len(splits), 3.5 + 0.17 * num_rows)
+    panels = figure.subplots(1, len(splits), sharey=True, squeeze=False)[0]
+    ends = [run.steps[-1] for s in settings for c in s.runs.values() for run in c if len(run.steps)]
+    right = max(ends, default=1.0)
+    unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
+    for axes, split in zip(panels, splits, strict=True):
+        for paper, dashes in _papers(settings):
+            _draw_paper_curve(axes, paper, dashes, split, metric, unit, right)
+        for setting in settings:
+            _draw_run_curves(axes, setting, split, metric, unit)
+        axes.set_title(f"{split} actions".capitalize(), fontsize=10, color=INK)
+        axes.set_xlim(0.0, 1.01 * right / unit)
+        axes.set_ylim(0.0, 100.0 if metric.unit == "%" else None)
+        axes.set_xlabel(f"Environment steps ({unit_name})", fontsize=9, color=INK)
+        tidy(axes)
+    panels[0].set_ylabel(metric.name, fontsize=9, color=INK)
+    figure.legend(
+        handles,
+        labels,
+        loc="outside lower center",
+        ncols=num_columns,
+        handler_map={tuple: HandlerTuple(ndivide=1, pad=0)},
+        **LEGEND,
+    )
+    set_title(figure, title)
+    return figure
+
+
+def _draw_run_curves(
+    axes: Axes, setting: CurveSetting, split: str, metric: Metric, unit: float
+) -> None:
+    runs = [run for run in setting.runs.get(split, ()) if len(run.steps)]
+    if not runs:
+        return
+    for run in runs:
+        axes.plot(
+            run.steps / unit,
+            metric.scale * run.values,
+            color=setting.color,
+            alpha=0.45,
+            linewidth=0.9,
+            label=f"{setting.label}: run",
+        )
+    steps, mean, std = mean_curve([run.held_at_best() for run in runs])
+    x, y, band = steps / unit, metric.scale * mean, metric.scale * std
+    if len(runs) > 1:
+        axes.fill_between(x, y - band, y + band, color=setting.color, alpha=0.18, linewidth=0)
+    points: dict[str, Any] = {"marker": "o", "clip_on": False} if len(x) == 1 else {}
+    axes.plot(x, y, color=setting.color, linewidth=2.2, label=setting.label, **points)
+
+
+def _papers(settings: Sequence[CurveSetting]) -> list[tuple[CurveSetting, Any]]:
+    """One setting for each of the paper's distinct curves, and the dashes of that curve."""
+    distinct = {setting.paper_label: setting for setting in settings if setting.paper}
+    return list(zip(distinct.values(), itertools.cycle(_PAPER_DASHES), strict=False))
+
+
+def _draw_paper_curve(
+    axes: Axes,
+    setting: CurveSetting,
+    dashes: Any,
+    split: str,
+    metric: Metric,
+    unit: float,
+    right: float,
+) -> None:
+    curve = setting.paper.get(split)
+    if curve is None:
+        return
+    x, y, band = curve.steps / unit, metric.scale * curve.mean, metric.scale * curve.std
+    axes.fill_between(x, y - band, y + band, color=PAPER_COLOR, alpha=0.15, linewidth=0)
+    axes.plot(x, y, color=PAPER_COLOR, linewidth=1.6, linestyle=dashes, label=setting.paper_label)
+    if curve.steps[-1] > 1.05 * right:
+        million = 1e-6 * curve.steps[-1]
+        end = f"paper after {million:.0f} million: {metric.text(curve.mean[-1])}{metric.unit}"
+        axes.axhline(y[-1], color=PAPER_COLOR, linewidth=0.9, linestyle=":", label=end)
+        axes.annotate(
+            end,
+            (0.0, y[-1]),
+            xycoords=axes.get_yaxis_transform(),
+            xytext=(4, 3),
+            textcoords="offset points",
+            fontsize=8,
+            color=PAPER_COLOR,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
+        )
+
+
+def _curve_legend(settings: Sequence[CurveSetting]) -> tuple[list[Any], list[str]]:
+    handles: list[Any] = []
+    labels: list[str] = []
+    for setting in settings:
+        num_runs = max((len(runs) for runs in setting.runs.values()), default=0)
+        strong = Line2D([], [], color=setting.color, linewidth=2.2)
+        band = Patch(color=setting.color, alpha=0.18, linewidth=0)
+        handles.append((band, strong) if num_runs > 1 else strong)
+        spread = f"mean ± std of {num_runs} seeds" if num_runs > 1 else "1 seed"
+        labels.append(f"{setting.label}, held at best ({spread})")
+    color = settings[0].color if len(settings) == 1 else INK
+    handles.append(Line2D([], [], color=color, linewidth=0.9, alpha=0.45))
+    labels.append("every evaluation of a run")
+    for setting, dashes in _papers(settings):
+        line = Line2D([], [], color=PAPER_COLOR, linewidth=1.6, linestyle=dashes)
+        handles.append((Patch(color=PAPER_COLOR, alpha=0.15, linewidth=0), line))
+        labels.append(f"{setting.paper_label}, held at best (mean ± std over seeds)")
+    return handles, labels

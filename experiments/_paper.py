@@ -1,0 +1,202 @@
+"""The paper's numbers: bars and learning curves, read from the released results (`paper/*.csv`)."""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+FOLDER = Path(__file__).parent / "paper"
+
+# Environment steps of a training run (experiments spec 2).
+_BUDGETS = {
+    "Grid World": 40e6,
+    "Recommender": 40e6,
+    "Recommender (fully observable)": 80e6,
+    "Shape Stacking": 3e6,
+}
+_CREATE_BUDGET = 60e6
+
+# (our method, our representation) -> the paper's method. Both names of a default modality count.
+_METHODS = {
+    ("ours", "hvae"): "ours",
+    ("ours", "hvae-xy"): "ours",
+    ("ours", "hvae-onehot"): "ours_onehot",
+    ("ours", "gt12"): "ours_engineered",
+    ("ours", "vae"): "vae",
+    ("ours", "vae-xy"): "vae",
+}
+
+
+class PaperError(ValueError):
+    """The paper has no such environment, method, split or figure."""
+
+
+@dataclass(frozen=True)
+class PaperResult:
+    """One bar of the paper, or one point of an analysis.
+
+    Attributes:
+      figure: e.g. `fig4_baselines`.
+      environment: e.g. `Grid World`.
+      method: e.g. `ours`, `vae`.
+      split: `train` or `test` actions.
+      metric: success_rate (a share in [0, 1]), ctr or final_height.
+      mean, std: over seeds; std is the population's.
+      num_seeds: seeds behind it.
+      source: the released file, or a remark.
+    """
+
+    figure: str
+    environment: str
+    method: str
+    split: str
+    metric: str
+    mean: float
+    std: float
+    num_seeds: int
+    source: str
+
+
+class PaperValue(NamedTuple):
+    """Mean and population standard deviation over the paper's seeds."""
+
+    mean: float
+    std: float
+    num_seeds: int
+
+
+class PaperCurve(NamedTuple):
+    """A learning curve: true environment steps f64[n], mean f64[n] and half-band f64[n]."""
+
+    steps: np.ndarray
+    mean: np.ndarray
+    std: np.ndarray
+
+
+def paper_method(method: str, representation: str) -> str | None:
+    """What the paper calls our method on our representation; None if it did not run it."""
+    return _METHODS.get((method, representation))
+
+
+def paper_environments() -> list[str]:
+    """Every environment that the paper reports on."""
+    return list(dict.fromkeys(row.environment for row in _results()))
+
+
+def paper_results(environment: str) -> list[PaperResult]:
+    """All results in an environment, in the order of the figures.
+
+    Raises:
+      PaperError: the paper has no such environment.
+    """
+    _check("environment", environment, paper_environments())
+    return [row for row in _results() if row.environment == environment]
+
+
+def paper_value(
+    environment: str, method: str, split: str, figure: str | None = None
+) -> PaperValue | None:
+    """One bar of the paper; None if it has none for the method, the split and the figure.
+
+    Args:
+      environment: as in `paper_environments`.
+      method: the paper's name, see `paper_method`.
+      split: `train` or `test` actions; no figure has bars of `validation`.
+      figure: where more than one figure has a bar of that name; default: the first of them.
+
+    Raises:
+      PaperError: a name that stands nowhere in the paper.
+    """
+    rows = paper_results(environment)
+    _check("method", method, dict.fromkeys(row.method for row in _results()))
+    _check("split", split, _splits())
+    if figure is not None:
+        _check("figure", figure, dict.fromkeys(row.figure for row in _results()))
+    for row in rows:
+        if (row.method, row.split) == (method, split) and figure in (None, row.figure):
+            return PaperValue(row.mean, row.std, row.num_seeds)
+    return None
+
+
+def paper_steps(environment: str) -> float:
+    """Environment steps of the paper's training runs.
+
+    Raises:
+      PaperError: the paper has no such environment.
+    """
+    _check("environment", environment, paper_environments())
+    return _BUDGETS.get(environment, _CREATE_BUDGET)
+
+
+def paper_curve(environment: str, method: str, split: str) -> PaperCurve | None:
+    """A learning curve up to the training budget; None if the paper shows none.
+
+    Every seed's curve is held at its maximum after it reached it, as the paper drew them (method
+    spec 11), so that its end is the mean of the seeds' best evaluations. What the released figures
+    draw past the budget is padding and left out.
+
+    Args:
+      environment: as in `paper_environments`.
+      method: the paper's name, see `paper_method`.
+      split: sets of `train` or `validation` actions.
+
+    Raises:
+      PaperError: a name that stands nowhere in the paper.
+    """
+    _check("environment", environment, paper_environments())
+    methods = [row.method for row in _results()] + [key[1] for key in _curves()]
+    _check("method", method, dict.fromkeys(methods))
+    _check("split", split, _splits())
+    curve = _curves().get((environment, method, split))
+    if curve is None:
+        return None
+    is_within = curve.steps <= paper_steps(environment)
+    return PaperCurve(*(values[is_within] for values in curve))
+
+
+def _splits() -> list[str]:
+    names = [row.split for row in _results()] + [key[2] for key in _curves()]
+    return list(dict.fromkeys(names))
+
+
+def _check(what: str, name: str, known: list[str] | dict[str, None]) -> None:
+    if name not in known:
+        raise PaperError(f"The paper has no {what} {name!r}; there are: {', '.join(known)}.")
+
+
+@lru_cache(maxsize=1)
+def _results() -> list[PaperResult]:
+    return [
+        PaperResult(
+            figure=row["figure"],
+            environment=row["environment"],
+            method=row["method"],
+            split=row["split"],
+            metric=row["metric"],
+            mean=float(row["mean"]),
+            std=float(row["std"]),
+            num_seeds=int(row["n_seeds"]),
+            source=row["source_note"],
+        )
+        for row in _rows("results.csv")
+    ]
+
+
+@lru_cache(maxsize=1)
+def _curves() -> dict[tuple[str, str, str], PaperCurve]:
+    points: dict[tuple[str, str, str], list[tuple[float, float, float]]] = {}
+    for row in _rows("learning_curves.csv"):
+        key = row["environment"], row["method"], row["split"]
+        steps = 1e6 * float(row["true_steps_million"])
+        points.setdefault(key, []).append((steps, float(row["mean"]), float(row["std"])))
+    return {key: PaperCurve(*np.array(sorted(rows)).T) for key, rows in points.items()}
+
+
+def _rows(name: str) -> list[dict[str, str]]:
+    with (FOLDER / name).open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))

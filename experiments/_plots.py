@@ -1,0 +1,272 @@
+"""Bars and scatter plots, as pure functions from numbers to a matplotlib `Figure`; and `save`.
+
+Figures are made through matplotlib's objects, without pyplot, so that nothing global changes.
+"""
+
+from __future__ import annotations
+
+import colorsys
+import textwrap
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch
+
+Color = tuple[float, float, float]
+
+INK = "#2d3440"
+FAINT_INK = "#7a828f"
+GRID_COLOR = "#e4e6ea"
+PAPER_COLOR = "#5b6472"  # Of the paper's numbers, whatever the method.
+
+_TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # Spec method 11.
+_TEST_HATCH = "///"
+
+
+LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK}
+
+
+@dataclass(frozen=True)
+class Metric:
+    """How a metric is shown.
+
+    Attributes:
+      name: of the axis, with its unit.
+      scale: what values are multiplied by.
+      limit: upper end of the axis in scaled units, None for what the numbers need.
+      unit: after a number.
+    """
+
+    name: str
+    scale: float = 1.0
+    limit: float | None = None
+    unit: str = ""
+
+    @classmethod
+    def of(cls, name: str, paper_name: str | None = None) -> Metric:
+        """An episode metric, under the paper's name for it if there is one."""
+        if paper_name == "success_rate" or name == "is_success":
+            return cls("Success rate (%)", 100.0, 110.0, "%")
+        if paper_name == "ctr":
+            return cls("Click-through rate", limit=0.5)
+        if paper_name == "final_height":
+            return cls("Final height", limit=2.75)
+        readable = name.removeprefix("is_").removeprefix("has_").replace("_", " ").capitalize()
+        is_share = name.startswith(("is_", "has_"))
+        return cls(f"{readable} (%)", 100.0, 110.0, "%") if is_share else cls(readable)
+
+    def text(self, value: float) -> str:
+        """A value, rounded for reading."""
+        return f"{value * self.scale:.1f}" if self.scale == 100.0 else f"{value:.3f}"
+
+
+@dataclass(frozen=True)
+class Bar:
+    """A mean with the ends of its error bar."""
+
+    mean: float
+    low: float
+    high: float
+
+
+@dataclass(frozen=True)
+class BarSetting:
+    """Bars of one setting: ours and, beside it, the paper's.
+
+    Attributes:
+      label: of the setting.
+      color: of our bars.
+      ours, paper: by split, `train` and `test`; either may be absent.
+      ours_note, paper_note: below the bars, such as `5 seeds`.
+    """
+
+    label: str
+    color: Color
+    ours: Mapping[str, Bar]
+    paper: Mapping[str, Bar]
+    ours_note: str = ""
+    paper_note: str = ""
+
+
+def hls_palette(n: int, l: float = 0.6, s: float = 0.9, h: float = 0.7) -> list[Color]:  # noqa: E741
+    """`n` colours of equal lightness `l` and saturation `s`, evenly spaced in hue from `h`."""
+    return [colorsys.hls_to_rgb((h + i / n) % 1.0, l, s) for i in range(n)]
+
+
+def bars(
+    settings: Sequence[BarSetting], metric: Metric, title: str = "", footnote: str = ""
+) -> Figure:
+    """Test actions in front (hatched), train actions behind (pale); ours beside the paper's.
+
+    Args:
+      settings: at least one.
+      metric: of the vertical axis.
+      title: of the figure.
+      footnote: below it, e.g. what the error bars are.
+    """
+    figure = new_figure(max(4.4, 1.6 + 2.1 * len(settings)), 4.2)
+    axes = figure.subplots()
+    ticks: list[tuple[float, str]] = []
+    num_lines = 1 + max(max(s.ours_note.count("\n"), s.paper_note.count("\n")) for s in settings)
+    highest = 0.0
+    for position, setting in enumerate(settings):
+        sides: list[tuple[str, Mapping[str, Bar], Color | str, str]] = [
+            ("ours", setting.ours, setting.color, setting.ours_note)
+        ]
+        if setting.paper:
+            sides.append(("paper", setting.paper, PAPER_COLOR, setting.paper_note))
+        for side, (name, by_split, color, note) in enumerate(sides):
+            x = position + (side - (len(sides) - 1) / 2) * 0.42
+            ticks.append((x, f"{name}\n{note}" if note else name))
+            for split in ("train", "test"):
+                if split in by_split:
+                    bar = by_split[split]
+                    _draw_bar(axes, x, bar, split, color, metric)
+                    highest = max(highest, metric.scale * max(bar.mean, bar.high))
+        axes.annotate(
+            textwrap.fill(setting.label, 26),
+            (position, 0.0),
+            xycoords=axes.get_xaxis_transform(),
+            xytext=(0, -22 - 12 * num_lines),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            fontsize=9.5,
+            fontweight="bold",
+            color=INK,
+        )
+    axes.set_xticks([x for x, _ in ticks], [text for _, text in ticks], fontsize=8.5)
+    axes.set_xlim(-0.55, len(settings) - 0.45)
+    axes.set_ylim(0.0, metric.limit if (metric.limit or 0.0) >= highest else 1.12 * highest)
+    if metric.limit == 110.0:
+        axes.set_yticks(range(0, 101, 20))
+    axes.set_ylabel(metric.name, fontsize=9, color=INK)
+    tidy(axes)
+    axes.tick_params(axis="x", length=0)
+    axes.grid(visible=False, axis="x")
+    handles = [
+        Patch(facecolor=PAPER_COLOR, alpha=_TEST_ALPHA, edgecolor="black", hatch=_TEST_HATCH),
+        Patch(facecolor=PAPER_COLOR, alpha=_TRAIN_ALPHA),
+    ]
+    labels = ["unseen test actions", "train actions"]
+    above: dict[str, Any] = {
+        "loc": "lower center",
+        "bbox_to_anchor": (0.5, 1.0),
+        "borderaxespad": 0.2,
+    }
+    axes.legend(handles, labels, ncols=2, **above, **LEGEND)
+    if footnote:
+        figure.supxlabel(footnote, fontsize=7.5, color=FAINT_INK)
+    set_title(figure, title)
+    return figure
+
+
+def _draw_bar(
+    axes: Axes, x: float, bar: Bar, split: str, color: Color | str, metric: Metric
+) -> None:
+    is_test = split == "test"
+    height = metric.scale * bar.mean
+    errors = [[metric.scale * (bar.mean - bar.low)], [metric.scale * (bar.high - bar.mean)]]
+    axes.bar(
+        x,
+        height,
+        width=0.36,
+        color=color,
+        alpha=_TEST_ALPHA if is_test else _TRAIN_ALPHA,
+        edgecolor="black" if is_test else "none",
+        hatch=_TEST_HATCH if is_test else None,
+        linewidth=0.8,
+        zorder=3 if is_test else 2,
+        label=split,
+    )
+    # Beside each other, so that both are seen where the bars are of like height.
+    shifted = x + (0.085 if is_test else -0.085)
+    axes.errorbar(shifted, height, yerr=errors, color=INK, capsize=2.5, linewidth=1.1, zorder=4)
+    axes.annotate(
+        metric.text(bar.mean),
+        (shifted, metric.scale * bar.high),
+        xytext=(0, 2.5),
+        textcoords="offset points",
+        ha="center",
+        fontsize=8.5,
+        fontweight="bold" if is_test else "normal",
+        color=INK if is_test else FAINT_INK,
+        zorder=5,
+    )
+
+
+def tsne_scatter(
+    points: np.ndarray,
+    labels: np.ndarray,
+    class_names: Sequence[str],
+    title: str = "",
+    subtitle: str = "",
+) -> Figure:
+    """Two-dimensional representations, coloured by class (spec method 11).
+
+    Args:
+      points: f[n, 2].
+      labels: int[n] index into `class_names`.
+      class_names: legend, in label order; classes without a point are left out.
+      title: of the figure.
+      subtitle: below it.
+    """
+    figure = new_figure(4.6, 4.8)
+    axes = figure.subplots()
+    colors = hls_palette(len(class_names))
+    for label, name in enumerate(class_names):
+        of_class = points[labels == label]
+        if len(of_class):
+            axes.scatter(
+                of_class[:, 0],
+                of_class[:, 1],
+                s=22,
+                color=colors[label],
+                edgecolor="white",
+                linewidth=0.4,
+                label=name,
+            )
+    axes.set_axis_off()
+    num_columns = min(4, len(class_names))
+    narrow: dict[str, Any] = {"handletextpad": 0.1, "columnspacing": 1.0, "markerscale": 1.4}
+    figure.legend(loc="outside lower center", ncols=num_columns, **narrow, **LEGEND)
+    axes.set_title(subtitle, fontsize=9, color=FAINT_INK)
+    set_title(figure, title)
+    return figure
+
+
+def save(figure: Figure, path: Path, pdf: bool = False) -> list[Path]:
+    """Writes `path` (PNG) and, if asked for, the same name with `.pdf`; returns what it wrote."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=200, facecolor="white")
+    written = [path]
+    if pdf:
+        written.append(path.with_suffix(".pdf"))
+        figure.savefig(written[-1], metadata={"CreationDate": None})
+    return written
+
+
+def new_figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure
+
+
+def set_title(figure: Figure, title: str) -> None:
+    if title:
+        figure.suptitle(title, fontsize=11, fontweight="bold", color=INK)
+
+
+def tidy(axes: Axes) -> None:
+    """Quiet axes: faint horizontal lines, no frame above and to the right."""
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.spines[["left", "bottom"]].set_color(FAINT_INK)
+    axes.tick_params(labelsize=8.5, colors=INK, color=FAINT_INK)
+    axes.grid(axis="y", color=GRID_COLOR, linewidth=0.8)
+    axes.set_axisbelow(True)

@@ -1,0 +1,200 @@
+"""The evaluations of runs as a table, beside the paper's numbers."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields
+from typing import Any
+
+import numpy as np
+
+from experiments._paper import PaperValue, paper_steps, paper_value
+from experiments._plots import Metric
+from experiments._runs import Group, Run
+
+RANDOM_PLAY = "random-play"  # What `demo` records in place of a checkpoint.
+
+
+@dataclass(frozen=True)
+class ResultRow:
+    """One evaluated set of actions of one setting, beside the paper's number.
+
+    Attributes:
+      setting: label of the group.
+      task, method, representation: of the runs.
+      actions: what the sets were drawn from: train, validation, test, ...
+      checkpoint, policy, set_size: what was evaluated, and on how many actions.
+      metric: the episode metric.
+      mean: ours; over seeds if there are several.
+      low, high: ends of its error bar.
+      error: what the error bar is.
+      num_seeds, num_episodes: ours; episodes per seed.
+      checkpoint_steps, trained_steps: environment steps of the evaluated checkpoint and of the
+        run; means over the seeds.
+      paper_method, paper_mean, paper_std, paper_num_seeds, paper_steps: the paper's number, None
+        where it has none for this setting.
+      difference: ours minus the paper's, in points (hundredths) for shares, else plain.
+      runs: the directories.
+    """
+
+    setting: str
+    task: str
+    method: str
+    representation: str
+    actions: str
+    checkpoint: str
+    policy: str
+    set_size: int
+    metric: str
+    mean: float
+    low: float
+    high: float
+    error: str
+    num_seeds: int
+    num_episodes: int
+    checkpoint_steps: float
+    trained_steps: float
+    paper_method: str | None
+    paper_mean: float | None
+    paper_std: float | None
+    paper_num_seeds: int | None
+    paper_steps: float | None
+    difference: float | None
+    runs: str
+
+    @property
+    def is_standard(self) -> bool:
+        """Evaluated as the paper does: sampled actions of the checkpoint chosen by validation."""
+        return self.checkpoint == "best" and self.policy == "sampled"
+
+
+def result_rows(group: Group) -> list[ResultRow]:
+    """Every evaluation of the group's runs, over the seeds that have it."""
+    found: dict[tuple[str, str, str, int], list[tuple[Run, dict[str, Any]]]] = {}
+    for run in group.runs:
+        for e in run.evaluations:
+            if group.task.selection_metric in e["metrics"]:
+                key = e["actions"], e["checkpoint"], e["policy"], e["set_size"]
+                found.setdefault(key, []).append((run, e))
+    order = ("train", "validation", "test")
+    rows = [_result_row(group, evaluations) for evaluations in found.values()]
+    return sorted(
+        rows,
+        key=lambda r: (
+            not r.is_standard,
+            r.checkpoint,
+            order.index(r.actions) if r.actions in order else len(order),
+        ),
+    )
+
+
+def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> ResultRow:
+    """One row from the same evaluation of each seed."""
+    runs = [run for run, _ in evaluations]
+    first = evaluations[0][1]
+    numbers = [e["metrics"][group.task.selection_metric] for _, e in evaluations]
+    means = np.array([n["mean"] for n in numbers])
+    mean, std = float(means.mean()), float(means.std())
+    if len(runs) > 1:
+        low, high, error = mean - std, mean + std, "population std over seeds"
+    else:
+        low, high = numbers[0]["low"], numbers[0]["high"]
+        error = "95 % interval over episodes"
+    paper = _paper_value(group, first)
+    scale = group.metric.scale
+    return ResultRow(
+        setting=group.label,
+        task=group.task.name,
+        method=group.config["method"],
+        representation=runs[0].representation,
+        actions=first["actions"],
+        checkpoint=first["checkpoint"],
+        policy=first["policy"],
+        set_size=first["set_size"],
+        metric=group.task.selection_metric,
+        mean=mean,
+        low=low,
+        high=high,
+        error=error,
+        num_seeds=len(runs),
+        num_episodes=min(e["num_episodes"] for _, e in evaluations),
+        checkpoint_steps=float(
+            np.mean([e["step"] * run.steps_per_update for run, e in evaluations])
+        ),
+        trained_steps=float(np.mean([run.trained_steps for run in runs])),
+        paper_method=group.paper_method if paper else None,
+        paper_mean=paper.mean if paper else None,
+        paper_std=paper.std if paper else None,
+        paper_num_seeds=paper.num_seeds if paper else None,
+        paper_steps=paper_steps(str(group.task.paper_environment)) if paper else None,
+        difference=scale * (mean - paper.mean) if paper else None,
+        runs=" ".join(str(run.path) for run in runs),
+    )
+
+
+def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
+    """The paper's number for an evaluation that was made as the paper's."""
+    is_comparable = (
+        evaluation["actions"] in ("train", "test")
+        and (evaluation["checkpoint"], evaluation["policy"]) == ("best", "sampled")
+        and evaluation["set_size"] == group.config["ppo"]["rollout"]["set_size"]
+    )
+    if not is_comparable or group.paper_method is None:
+        return None
+    environment = str(group.task.paper_environment)
+    return paper_value(environment, group.paper_method, evaluation["actions"])
+
+
+def as_csv(rows: Sequence[ResultRow]) -> str:
+    """The rows with all fields; an unknown number is empty."""
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [f.name for f in fields(ResultRow)], lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(asdict(row) for row in rows)
+    return text.getvalue()
+
+
+def as_markdown(title: str, rows: Sequence[ResultRow], metric: Metric, notes: Sequence[str]) -> str:
+    """The rows for reading, and what their numbers are."""
+    header = ["setting", "actions", "policy", "ours", "paper", "difference", "seeds"]
+    header += ["episodes", "steps (million)", "run"]
+    lines = [f"# {title}: {metric.name.lower()}", ""]
+    lines += [_line(header), _line(["---"] * len(header))]
+    lines += [_line(_cells(row, metric)) for row in rows]
+    lines += [
+        "",
+        "Ours: [low, high] is the 95 % interval over the episodes of one run; ± is the population "
+        "standard deviation over seeds, as in the paper, whose numbers are 5,000 sampled episodes "
+        "per seed. Seeds and steps: ours / the paper's; episodes are per seed. Steps are those "
+        "that a run was trained for; the checkpoint is the best one by validation."
+        " Difference: ours minus the paper's" + (", in percentage points." if metric.unit else "."),
+    ]
+    lines += [f"\n{note}" for note in notes]
+    return "\n".join(lines) + "\n"
+
+
+def _cells(row: ResultRow, metric: Metric) -> list[str]:
+    error = f"[{metric.text(row.low)}, {metric.text(row.high)}]"
+    if row.num_seeds > 1:
+        error = f"± {metric.text(row.high - row.mean)}"
+    policy = "random play" if row.checkpoint == RANDOM_PLAY else f"{row.policy}, {row.checkpoint}"
+    paper = difference = "-"
+    seeds, steps = str(row.num_seeds), f"{1e-6 * row.trained_steps:.3g}"
+    if row.checkpoint == RANDOM_PLAY:
+        steps = "-"
+    if row.paper_mean is not None and row.paper_std is not None and row.paper_steps is not None:
+        paper = f"{metric.text(row.paper_mean)} ± {metric.text(row.paper_std)}"
+        difference = f"{row.difference:+.1f}" if metric.unit else f"{row.difference:+.3f}"
+        seeds += f" / {row.paper_num_seeds}"
+        steps += f" / {1e-6 * row.paper_steps:.3g}"
+    ours = f"{metric.text(row.mean)} {error}"
+    actions = f"{row.actions}, sets of {row.set_size}"
+    episodes = f"{row.num_episodes:,}"
+    cells = [row.setting, actions, policy, ours, paper, difference, seeds, episodes, steps]
+    return [*cells, row.runs.replace(" ", "<br>")]
+
+
+def _line(cells: Sequence[str]) -> str:
+    return "| " + " | ".join(cells) + " |"

@@ -1,0 +1,221 @@
+"""Run directories as the figures read them, grouped over seeds."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from experiments._artifacts import SPLIT_FILE, TABLE_FILE
+from experiments._flags import UsageError, load_task
+from experiments._paper import paper_environments, paper_method, paper_results
+from experiments._plots import Metric
+from jaxnew.actions import ActionSplit
+from jaxnew.config import differences
+from jaxnew.metrics import read
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.run_directory import RunDirectory
+from jaxnew.task import Task
+
+# Fields that tell settings of one method and representation apart in a label, most telling first.
+_LABEL_ORDER = (
+    "task",
+    "split",
+    "split_hash",
+    "table_hash",
+    "hyperparameters",
+    "num_updates",
+    "ppo",
+)
+_LABEL_CHANGES = 2
+
+
+@dataclass(frozen=True)
+class Run:
+    """What one run directory holds.
+
+    Attributes:
+      path: the directory.
+      config: its plain configuration.
+      reports: the lines of `metrics.jsonl`.
+      evaluations: what `evaluate` wrote.
+      table, split: the representations and the split of the run; None if it was interrupted before
+        it had them.
+    """
+
+    path: Path
+    config: dict[str, Any]
+    reports: list[dict[str, Any]]
+    evaluations: list[dict[str, Any]]
+    table: RepresentationTable | None
+    split: ActionSplit | None
+
+    @property
+    def is_policy(self) -> bool:
+        """A run of `train` or a member of `sweep`; else one of `embed`."""
+        return "ppo" in self.config
+
+    @property
+    def steps_per_update(self) -> int:
+        """Environment steps of an update."""
+        rollout = self.config["ppo"]["rollout"]
+        return int(rollout["num_envs"] * rollout["num_steps"])
+
+    @property
+    def trained_steps(self) -> int:
+        """Environment steps so far."""
+        return self.steps_per_update * max((r["step"] for r in self.reports), default=0)
+
+    @property
+    def representation(self) -> str:
+        """`hvae`, `gt12`, ...: also where the run was given a directory or a file of vectors."""
+        given = str(self.config["representation"])
+        if Path(given).name == given and not given.endswith(".npz"):
+            return given
+        made = self.table.source.split(",")[0].removeprefix("engineered:") if self.table else ""
+        return made if re.fullmatch(r"[\w-]+", made) else Path(given).stem
+
+    def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Environment steps and values f64[n] of an evaluated metric, e.g. `train/is_success`."""
+        points = [(r["step"], r[name]) for r in self.reports if r.get(name) is not None]
+        steps, values = np.array(points, np.float64).reshape(-1, 2).T
+        return steps * self.steps_per_update, values
+
+
+@dataclass(frozen=True)
+class Group:
+    """Runs of `train` that differ in their seed only.
+
+    Attributes:
+      label: tells it from the other groups.
+      task: of its runs.
+      runs: ascending by seed.
+    """
+
+    label: str
+    task: Task
+    runs: tuple[Run, ...]
+
+    @property
+    def config(self) -> dict[str, Any]:
+        """Of the first run; the others differ in `seed`."""
+        return self.runs[0].config
+
+    @property
+    def paper_method(self) -> str | None:
+        """What the paper calls this setting; None where it has no counterpart."""
+        is_in_paper = self.task.paper_environment in paper_environments()
+        if not is_in_paper or self.config["split"] != self.task.default_split:
+            return None
+        return paper_method(self.config["method"], self.runs[0].representation)
+
+    @property
+    def metric(self) -> Metric:
+        """How the task's selection metric is shown."""
+        return metric_of(self.task)
+
+
+def metric_of(task: Task) -> Metric:
+    """How the selection metric of a task is shown."""
+    if task.paper_environment not in paper_environments():
+        return Metric.of(task.selection_metric)
+    return Metric.of(task.selection_metric, paper_results(task.paper_environment)[0].metric)
+
+
+def read_runs(paths: Sequence[Path]) -> list[Run]:
+    """The runs at `paths`; a sweep stands for its members, a path given twice counts once.
+
+    Raises:
+      UsageError: no path, or one of a kind that has no figures.
+      RunDirectoryError: a path is no run directory, or it is damaged.
+    """
+    runs: dict[Path, Run] = {}
+    for path in paths:
+        members = _members(path)
+        for run_path in [path] if members is None else members:
+            runs.setdefault(run_path.resolve(), _read_run(run_path))
+    if not runs:
+        raise UsageError("Say which runs to draw: --run=DIRECTORY[,DIRECTORY...].")
+    return list(runs.values())
+
+
+def _members(path: Path) -> list[Path] | None:
+    """The member directories of a sweep; None for another run."""
+    if "members" not in RunDirectory.load(path).config:
+        return None
+    members = sorted(p.parent for p in path.glob("members/*/config.json"))
+    if not members:
+        raise UsageError(f"The sweep {path} has written no members yet; run it to its end.")
+    return members
+
+
+def _read_run(path: Path) -> Run:
+    config = RunDirectory.load(path).config
+    if "representation" not in config or not ("ppo" in config or "model" in config):
+        raise UsageError(f"{path} is no run of train, sweep or embed, so there is nothing to draw.")
+    has_inputs = (path / TABLE_FILE).exists() and (path / SPLIT_FILE).exists()
+    files = sorted((path / "evaluation").glob("*.json"))
+    evaluations = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    return Run(
+        path=path,
+        config=config,
+        reports=read(path),
+        evaluations=[e for e in evaluations if "actions" in e and "metrics" in e],
+        table=RepresentationTable.load(path / TABLE_FILE) if has_inputs else None,
+        split=ActionSplit.load(path / SPLIT_FILE) if has_inputs else None,
+    )
+
+
+def group_runs(runs: Sequence[Run]) -> list[Group]:
+    """Runs of `train` with equal configurations but for the seed, in the order given.
+
+    Raises:
+      UsageError: two runs of a group have the same seed, so that they are not two samples.
+    """
+    by_config: dict[str, list[Run]] = {}
+    for run in runs:
+        key = json.dumps({**run.config, "seed": None}, sort_keys=True)
+        by_config.setdefault(key, []).append(run)
+    groups = []
+    for members in by_config.values():
+        members.sort(key=lambda run: run.config["seed"])
+        for one, other in pairwise(members):
+            if one.config["seed"] == other.config["seed"]:
+                raise UsageError(
+                    f"{one.path} and {other.path} are the same setting with the same seed, "
+                    f"{one.config['seed']}; give one of them."
+                )
+        first = members[0]
+        label = f"{first.config['method']}, {first.representation}"
+        groups.append(Group(label, load_task(first.config["task"]), tuple(members)))
+    return _with_distinct_labels(groups)
+
+
+def _with_distinct_labels(groups: list[Group]) -> list[Group]:
+    """The groups; those of one label get values in which they differ appended to it."""
+    labelled: list[Group] = []
+    for group in groups:
+        others = [other for other in groups if other.label == group.label and other is not group]
+        changes: dict[str, Any] = {}
+        for other in others:
+            changes |= {name: value for name, value, _ in differences(group.config, other.config)}
+        if "table_hash" in changes and group.runs[0].table is not None:
+            changes["table_hash"] = f"({group.runs[0].table.source})"
+        names = [name for name in changes if name != "seed" and not name.startswith("loop.")]
+        names.sort(key=_label_rank)
+        words = [f"{name.rpartition('.')[2]} {changes[name]}" for name in names[:_LABEL_CHANGES]]
+        label = ", ".join([group.label, *words])
+        number = 1 + sum(done.label.partition(" #")[0] == label for done in labelled)
+        labelled.append(replace(group, label=f"{label} #{number}" if number > 1 else label))
+    return labelled
+
+
+def _label_rank(name: str) -> int:
+    group = name.partition(".")[0]
+    return _LABEL_ORDER.index(group) if group in _LABEL_ORDER else len(_LABEL_ORDER)

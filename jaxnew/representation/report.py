@@ -1,0 +1,138 @@
+"""How good a table is before any policy is trained (spec method 3.8). NumPy only."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+NUM_NEIGHBOURS = 5
+ACTIVE_STD = 0.1
+
+
+def nearest_neighbours(vectors: np.ndarray, num_neighbours: int = NUM_NEIGHBOURS) -> np.ndarray:
+    """Rows of the nearest other rows, Euclidean; ties go to the lower row.
+
+    Args:
+      vectors: f[A, d], A > `num_neighbours`.
+      num_neighbours: k.
+    Returns:
+      int[A, k], nearest first.
+
+    Raises:
+      ValueError: there are too few rows.
+    """
+    if len(vectors) <= num_neighbours:
+        raise ValueError(
+            f"{num_neighbours} nearest neighbours need more than {num_neighbours} actions; got "
+            f"{len(vectors)}."
+        )
+    vectors = vectors.astype(np.float64)
+    norms = np.square(vectors).sum(axis=1)
+    squared = norms[:, None] + norms - 2.0 * vectors @ vectors.T
+    np.fill_diagonal(squared, np.inf)
+    return np.argsort(squared, axis=1, kind="stable")[:, :num_neighbours]
+
+
+def neighbour_purity(
+    vectors: np.ndarray,
+    labels: np.ndarray,
+    subset: Sequence[int] | np.ndarray | None = None,
+    num_neighbours: int = NUM_NEIGHBOURS,
+) -> float:
+    """Share of the nearest neighbours that have the label of their query (spec method 3.8).
+
+    Args:
+      vectors: f[A, d].
+      labels: int[A].
+      subset: rows that serve as queries and as candidates; None for all. The "test half" of the
+        spec is the held-out half: validation and test together.
+      num_neighbours: k; a query is not its own neighbour.
+
+    Raises:
+      ValueError: there are too few rows.
+    """
+    if subset is not None:
+        vectors, labels = vectors[np.asarray(subset)], labels[np.asarray(subset)]
+    neighbours = nearest_neighbours(vectors, num_neighbours)
+    return float(np.mean(labels[neighbours] == labels[:, None]))
+
+
+def linear_r2(vectors: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """In-sample R2 of ordinary least squares with intercept, per target column (spec method 3.8).
+
+    Args:
+      vectors: f[A, d].
+      targets: f[A, ...], at least one column; flattened to [A, k].
+    Returns:
+      f64[k]; NaN for a constant column, which has no variance to explain.
+    """
+    design = np.concatenate([vectors, np.ones((len(vectors), 1))], axis=1).astype(np.float64)
+    targets = np.asarray(targets, np.float64).reshape(len(vectors), -1)
+    solution = np.linalg.lstsq(design, targets, rcond=None)[0]
+    residual = np.square(targets - design @ solution).sum(axis=0)
+    total = np.square(targets - targets.mean(axis=0)).sum(axis=0)
+    return np.where(total > 0, 1.0 - residual / np.where(total > 0, total, 1.0), np.nan)
+
+
+def entry_statistics(vectors: np.ndarray) -> dict[str, float]:
+    """Mean, std, min and max of all entries, and the number of dimensions with std > 0.1."""
+    return {
+        "mean": float(vectors.mean()),
+        "std": float(vectors.std()),
+        "min": float(vectors.min()),
+        "max": float(vectors.max()),
+        "active_dimensions": int(np.sum(vectors.std(axis=0) > ACTIVE_STD)),
+        "dimensions": int(vectors.shape[1]),
+    }
+
+
+def describe(
+    vectors: np.ndarray,
+    labels: np.ndarray,
+    held_out: Sequence[int] | np.ndarray,
+    targets: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, Any]:
+    """The numbers of spec method 3.8 for one table, as plain JSON.
+
+    Args:
+      vectors: f32[A, d].
+      labels: int[A].
+      held_out: rows outside the train split, for the second purity.
+      targets: by name f[A, ...], what a linear map of the representation should explain.
+    """
+    explained = {name: linear_r2(vectors, values) for name, values in (targets or {}).items()}
+    return {
+        "purity_all": neighbour_purity(vectors, labels),
+        "purity_held_out": neighbour_purity(vectors, labels, held_out),
+        "linear_r2": {name: _plain(values) for name, values in explained.items()},
+        "linear_r2_mean": {name: _plain(values.mean()) for name, values in explained.items()},
+        "entries": entry_statistics(vectors),
+    }
+
+
+def tsne(vectors: np.ndarray, seed: int) -> np.ndarray:
+    """Two dimensions for a scatter plot: scikit-learn's t-SNE, perplexity 10 (spec method 11).
+
+    Args:
+      vectors: f[A, d], A > 10. The released figures draw at most 400 actions.
+      seed: of scikit-learn's generator.
+    Returns:
+      f32[A, 2].
+
+    Raises:
+      ImportError: scikit-learn is missing.
+    """
+    try:
+        from sklearn.manifold import TSNE
+    except ImportError as err:
+        raise ImportError("t-SNE plots need scikit-learn: pip install scikit-learn") from err
+    return TSNE(n_components=2, perplexity=10, random_state=seed).fit_transform(vectors)
+
+
+def _plain(values: np.ndarray) -> Any:
+    """Floats for JSON, which has no NaN: None instead."""
+    if np.ndim(values):
+        return [_plain(value) for value in values]
+    return float(values) if np.isfinite(values) else None

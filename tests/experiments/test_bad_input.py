@@ -1,0 +1,163 @@
+"""A user's mistake ends a command with one line that says what was given, allowed, and to do."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from envs_mjx.grid_world import skill_universe
+from experiments._artifacts import Domain, find_table
+from experiments._flags import load_task
+from jaxnew import observations
+from jaxnew.actions import SplitMismatch
+from jaxnew.representation.table import RepresentationTable
+from tests.experiments.commands import run
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def policy_run(runs: Path) -> Path:
+    run("train", "--budget=smoke", "--representation=gt12", f"--runs={runs}")
+    return runs / "grid_world" / "ours-gt12-default-smoke-31"
+
+
+@pytest.mark.parametrize(
+    ("flags", "says"),
+    [
+        (["--task=gridworld"], ["gridworld", "grid_world"]),
+        (["--task=jaxnew.actions:TASK"], ["jaxnew.actions:TASK", "Task"]),
+        (["--method=our"], ["'our'", "ours"]),
+        (["--representation=gt13"], ["gt13", "gt12", "hvae"]),
+        (["--split=half"], ["half", "default"]),
+        (["--budget=papr"], ["papr", "paper"]),
+        (["--set=ppo.num_epoch=2"], ["ppo.num_epoch", "ppo.num_epochs"]),
+        (["--set=ppo.num_epochs=two"], ["ppo.num_epochs", "int", "two"]),
+        (["--set=ppo.num_minibatches=7"], ["256", "num_minibatches=7"]),
+        (["--set=ppo.rollout.set_size=300"], ["300", "validation", "256"]),
+        (["train"], ["train", "--flag=value"]),
+    ],
+)
+def test_wrong_names_and_values(runs: Path, flags: list[str], says: list[str]) -> None:
+    defaults = ["--budget=smoke", "--representation=gt12", f"--runs={runs / 'none'}"]
+    output = run("train", *defaults, *flags, fails=True)
+    last_lines = output[-700:]
+    for words in says:
+        assert words in last_lines
+
+
+def test_tables_that_do_not_fit(policy_run: Path, runs: Path, tmp_path: Path) -> None:
+    table = RepresentationTable.load(policy_run / "table.npz")
+    cases = {
+        "other_universe": {"universe_hash": "0123456789abcdef"},
+        "other_split": {"universe_hash": table.universe_hash, "split_hash": "0123456789abcdef"},
+        "too_few": {"vectors": table.vectors[:10], "ids": table.ids[:10]},
+    }
+    for name, change in cases.items():
+        fields = {"vectors": table.vectors, "ids": table.ids, **change}
+        RepresentationTable(**fields).save(tmp_path / f"{name}.npz")
+    (tmp_path / "cut.npz").write_bytes((policy_run / "table.npz").read_bytes()[:1000])
+    np.savez(tmp_path / "nan.npz", ids=table.ids, vectors=table.vectors * np.nan)
+    says = {
+        "other_universe": "0123456789abcdef",
+        "other_split": "0123456789abcdef",
+        "too_few": "lacks 1014",
+        "cut": "damaged",
+        "nan": "NaN",
+    }
+    domain = Domain.of(load_task("grid_world"), None)
+    for name, words in says.items():
+        with pytest.raises((ValueError, SplitMismatch), match=words):
+            find_table(domain, runs, str(tmp_path / f"{name}.npz"), "smoke")
+
+
+def test_a_user_s_own_table_trains(policy_run: Path, tmp_path: Path) -> None:
+    vectors = np.random.default_rng(0).normal(size=(1024, 3))
+    np.savez(tmp_path / "mine.npz", ids=np.arange(1024), vectors=vectors)
+    output = run(
+        "train",
+        "--budget=smoke",
+        f"--representation={tmp_path / 'mine.npz'}",
+        f"--runs={tmp_path}",
+    )
+    assert "ours-mine" in output
+
+
+def test_damaged_run_directories(policy_run: Path, tmp_path: Path) -> None:
+    """Each case is a copy with one thing broken; evaluating says which, and changes nothing."""
+
+    def broken(name: str) -> Path:
+        return Path(shutil.copytree(policy_run, tmp_path / name))
+
+    no_config = broken("no_config")
+    (no_config / "config.json").unlink()
+    cut_config = broken("cut_config")
+    (cut_config / "config.json").write_text('{"task": "grid')
+    no_checkpoint = broken("no_checkpoint")
+    shutil.rmtree(no_checkpoint / "checkpoints")
+    cut_checkpoint = broken("cut_checkpoint")
+    for file in (cut_checkpoint / "checkpoints" / "best").rglob("*"):
+        if file.is_file():
+            file.write_bytes(file.read_bytes()[:10])
+    swapped_split = broken("swapped_split")
+    record = json.loads((swapped_split / "split.json").read_text())
+    record["train"][0], record["test"][0] = record["test"][0], record["train"][0]
+    (swapped_split / "split.json").write_text(json.dumps(record))
+    for path, words in [
+        (no_config, "config.json"),
+        (cut_config, "config.json"),
+        (no_checkpoint, "checkpoint"),
+        (cut_checkpoint, "checkpoint"),
+        (swapped_split, "split.json"),
+    ]:
+        output = run("evaluate", f"--run={path}", "--episodes=8", fails=True)
+        assert words in output[-900:]
+    assert run("evaluate", f"--run={tmp_path / 'nowhere'}", fails=True)
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ("1 2 x", "x"),
+        ("", "no action id"),
+        ("1 1 2", "twice"),
+        ("5 1024", "0..1023"),
+        ("1 2 3", "3"),
+    ],
+)
+def test_bad_id_files(policy_run: Path, tmp_path: Path, content: str, says: str) -> None:
+    file = tmp_path / "ids.txt"
+    file.write_text(content)
+    output = run("evaluate", f"--run={policy_run}", f"--ids={file}", "--episodes=8", fails=True)
+    assert says in output[-500:]
+
+
+def test_a_nan_stops_the_run_and_keeps_what_was_saved(runs: Path, tmp_path: Path) -> None:
+    flags = ["--budget=smoke", "--representation=gt12", f"--workdir={tmp_path / 'nan'}"]
+    output = run("train", *flags, "--set=hyperparameters.learning_rate=1e38", fails=True)
+    assert "NonFiniteError" in output
+    assert "step" in output
+    again = run("train", *flags, "--set=hyperparameters.learning_rate=1e38", fails=True)
+    assert "NonFiniteError" in again
+
+
+def test_damaged_recordings_are_found(tmp_path: Path) -> None:
+    run("collect", "--budget=smoke", f"--runs={tmp_path}")
+    file = tmp_path / "grid_world" / "recordings-16" / "recordings.npy"
+    content = bytearray(file.read_bytes())
+    content[-5] ^= 0xFF
+    file.write_bytes(content)
+    with pytest.raises(observations.ObservationsError, match="1023"):
+        observations.load(file.parent, skill_universe())
+    output = run("collect", "--budget=smoke", f"--runs={tmp_path}")
+    assert "1024 actions x 16 recordings" in output
+    observations.load(file.parent, skill_universe())

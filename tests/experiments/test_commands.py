@@ -1,0 +1,263 @@
+"""Every command at smoke budget, each in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments._artifacts import Domain
+from experiments._flags import load_task
+from jaxnew import metrics, observations
+from jaxnew.checkpoint import Checkpointer
+from jaxnew.representation.table import RepresentationTable
+from tests.experiments.commands import ROOT, run
+
+pytestmark = pytest.mark.integration
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.fixture(scope="module")
+def hvae_run(runs: Path) -> Path:
+    """Both stages, by the commands of the README's quickstart at smoke budget."""
+    readme = (ROOT / "README.md").read_text()
+    commands = re.findall(r"^python -m experiments\.(.+ --budget=laptop)$", readme, re.MULTILINE)
+    assert [command.split()[0] for command in commands] == ["collect", "embed", "train"]
+    for command in commands:
+        run(*command.replace("laptop", "smoke").split(), f"--runs={runs}")
+    return runs / "grid_world" / "ours-hvae-default-smoke-31"
+
+
+@pytest.fixture(scope="module")
+def encoder_run(hvae_run: Path) -> Path:
+    return hvae_run.parent / "embed-hvae-default-smoke-31"
+
+
+def read_json(path: Path) -> dict:
+    return json.loads(path.read_text())
+
+
+def test_a_run_directory_explains_itself(hvae_run: Path, encoder_run: Path) -> None:
+    config = read_json(hvae_run / "config.json")
+    table = RepresentationTable.load(hvae_run / "table.npz")
+    assert config["table_hash"] == table.hash
+    assert table.hash == RepresentationTable.load(encoder_run / "table.npz").hash
+    assert table.vectors.shape == (1024, 16)
+    session = read_json(hvae_run / "provenance.json")["sessions"][-1]
+    assert session["split_hash"] == config["split_hash"]
+    assert "experiments/train.py" in " ".join(session["command_line"])
+    lines = metrics.read(hvae_run)
+    assert {line["step"] for line in lines} == {2, 4}
+    assert any("validation/is_success" in line for line in lines)
+    for kind in ("best", "latest"):
+        assert Checkpointer(hvae_run / "checkpoints").steps(kind)
+
+
+def test_evaluate_in_a_new_process_and_twice_the_same(hvae_run: Path) -> None:
+    flags = ("evaluate", f"--run={hvae_run}", "--sets=train,test", "--episodes=96")
+    output = run(*flags)
+    assert "test (96 episodes, sampled)" in output
+    file = hvae_run / "evaluation" / "test-best-sampled-m50.json"
+    first = read_json(file)
+    assert first["num_episodes"] == 96
+    assert first["num_actions"] == 256
+    success = first["metrics"]["is_success"]
+    assert success["low"] <= success["mean"] <= success["high"]
+    run(*flags)
+    second = read_json(file)
+    assert second["metrics"] == first["metrics"]
+
+
+def test_evaluate_on_a_checkpoint_ids_a_mixture_and_greedily(
+    hvae_run: Path, tmp_path: Path
+) -> None:
+    split = read_json(hvae_run / "split.json")
+    ids_file = tmp_path / "chosen.txt"
+    ids_file.write_text(" ".join(map(str, split["test"][:60])))
+    latest = next((hvae_run / "checkpoints" / "latest").iterdir())
+    run("evaluate", f"--run={latest}", f"--ids={ids_file}", "--episodes=32", "--deterministic")
+    found = read_json(hvae_run / "evaluation" / "ids-chosen-latest-greedy-m50.json")
+    assert (found["num_actions"], found["checkpoint"]) == (60, "latest")
+    run("evaluate", f"--run={hvae_run}", "--unseen_ratio=0.5", "--episodes=32", "--set_size=20")
+    found = read_json(hvae_run / "evaluation" / "unseen-0.5-best-sampled-m20.json")
+    assert (found["num_actions"], found["set_size"]) == (128 + 256, 20)
+
+
+def test_new_actions_are_recorded_encoded_and_acted_with(
+    hvae_run: Path, encoder_run: Path, tmp_path: Path
+) -> None:
+    """Paper algorithm 2 from recordings to episodes, with nothing trained."""
+    domain = Domain.of(load_task("grid_world"), None)
+    ids = domain.split.test[:64]
+    recorded = observations.collect(
+        tmp_path / "recordings",
+        domain.play.record_block,
+        format=domain.play.format,
+        universe=domain.universe,
+        ids=ids,
+        num_recordings=8,
+        seed=7,
+        block_actions=64,
+    )
+    observations.save_npz(tmp_path / "new.npz", recorded)
+    table_file = tmp_path / "new_table.npz"
+    output = run(
+        "embed",
+        f"--checkpoint={encoder_run}",
+        f"--observations={tmp_path / 'new.npz'}",
+        f"--output={table_file}",
+    )
+    assert "64 actions, 16 numbers each" in output
+    new = RepresentationTable.load(table_file)
+    np.testing.assert_array_equal(new.ids, np.sort(ids))
+    own = RepresentationTable.load(encoder_run / "table.npz").rows(new.ids)
+    assert not np.array_equal(new.vectors, own), "other recordings give other vectors"
+    run("evaluate", f"--run={hvae_run}", f"--table={table_file}", "--episodes=32")
+    found = read_json(hvae_run / "evaluation" / "table-new_table-best-sampled-m50.json")
+    assert found["num_actions"] == 64
+
+
+def test_train_again_finds_the_run_complete(hvae_run: Path, runs: Path) -> None:
+    before = (hvae_run / "metrics.jsonl").read_bytes()
+    output = run("train", "--budget=smoke", "--representation=hvae", f"--runs={runs}")
+    assert "already complete" in output
+    assert (hvae_run / "metrics.jsonl").read_bytes() == before
+
+
+def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None:
+    before = read_json(hvae_run / "config.json")
+    output = run(
+        "train",
+        "--budget=smoke",
+        "--representation=hvae",
+        f"--runs={runs}",
+        "--set=hyperparameters.clip=0.2",
+        fails=True,
+    )
+    assert "hyperparameters.clip" in output
+    assert "0.1" in output
+    assert "0.2" in output
+    assert "--overwrite" in output
+    assert read_json(hvae_run / "config.json") == before
+
+
+def test_an_embed_report(encoder_run: Path, runs: Path) -> None:
+    run("embed", "--budget=smoke", "--representation=hvae", f"--runs={runs}")
+    numbers = read_json(encoder_run / "evaluation" / "representation.json")
+    assert 0.0 <= numbers["purity_held_out"] <= 1.0
+    assert len(numbers["linear_r2"]["net displacement"]) == 2
+    assert len(numbers["linear_r2"]["per-move coordinates"]) == 10
+
+
+@pytest.mark.parametrize("representation", ["hvae-onehot", "vae"])
+def test_other_representations_train(runs: Path, representation: str) -> None:
+    run("embed", "--budget=smoke", f"--representation={representation}", f"--runs={runs}")
+    path = runs / "grid_world" / f"embed-{representation}-default-smoke-31"
+    assert RepresentationTable.load(path / "table.npz").vectors.shape == (1024, 16)
+
+
+def test_train_makes_what_it_needs(tmp_path: Path) -> None:
+    """Recordings and encoder are made on demand, each with a line that says so."""
+    output = run("train", "--budget=smoke", "--representation=hvae", f"--runs={tmp_path}")
+    assert "1024 actions x 16 recordings" in output
+    assert "Training hvae (8 steps" in output
+    assert "update 4 of 4" in output
+
+
+def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
+    environment = {**os.environ, "JAX_DEBUG_KEY_REUSE": "1"}
+    run(
+        "train",
+        "--budget=smoke",
+        "--representation=hvae",
+        f"--runs={tmp_path}",
+        environment=environment,
+    )
+
+
+def test_sweep_members_are_ordinary_runs(runs: Path) -> None:
+    run(
+        "sweep",
+        "--budget=smoke",
+        "--representation=gt5",
+        "--seeds=1,2",
+        "--vary=entropy_coefficient=0.0,0.1",
+        f"--runs={runs}",
+    )
+    members = runs / "grid_world" / "sweep-ours-gt5" / "members"
+    configs = [read_json(members / f"{i:03d}" / "config.json") for i in range(4)]
+    found = {(c["seed"], c["hyperparameters"]["entropy_coefficient"]) for c in configs}
+    assert found == {(1, 0.0), (2, 0.0), (1, 0.1), (2, 0.1)}
+    run("evaluate", f"--run={members / '003'}", "--episodes=32")
+    assert (members / "003" / "evaluation" / "test-best-sampled-m50.json").is_file()
+    assert metrics.read(members / "003")[-1]["step"] == 4
+    summary = read_json(members.parent / "evaluation" / "members.json")["members"]
+    assert [row["seed"] for row in summary] == [1, 2, 1, 2]
+
+
+def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:
+    """SIGKILL at random instants; the end equals that of an undisturbed run."""
+    flags = (
+        "--budget=smoke",
+        "--representation=gt12",
+        f"--runs={runs}",
+        "--set=num_updates=120",
+        "--set=ppo.lr_steps=40000",
+    )
+    calm, killed = runs / "calm", runs / "killed"
+    run("train", *flags, f"--workdir={calm}")
+    rng = random.Random(0)
+    command = [sys.executable, "-m", "experiments.train", *flags, f"--workdir={killed}"]
+    kills = 0
+    while kills < 3:
+        process = subprocess.Popen(
+            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        steps = newest_step(killed)
+        while process.poll() is None and newest_step(killed) == steps:
+            time.sleep(0.01)
+        time.sleep(rng.uniform(0.0, 0.3))
+        if process.poll() is not None:
+            break
+        os.kill(process.pid, signal.SIGKILL)
+        process.wait()
+        kills += 1
+    assert kills == 3, "the run ended before it was killed three times"
+    output = run("train", *flags, f"--workdir={killed}")
+    assert "resuming" in output
+    assert timeless(metrics.read(killed)) == timeless(metrics.read(calm))
+    for kind in ("best", "latest"):
+        assert checkpoint_arrays(killed, kind) == checkpoint_arrays(calm, kind)
+
+
+def newest_step(path: Path) -> int:
+    return max(Checkpointer(path / "checkpoints").steps("latest"), default=-1)
+
+
+def timeless(lines: list[dict]) -> list[dict]:
+    return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in lines]
+
+
+def checkpoint_arrays(path: Path, kind: str) -> list[bytes]:
+    """The bits of a checkpoint's state, read back by the code that `evaluate` uses."""
+    import jax
+
+    from experiments._training import load_state, load_trainer
+
+    run_directory, trainer, _ = load_trainer(path)
+    state, step = load_state(run_directory, trainer, kind)
+    state = state.replace(key=jax.random.key_data(state.key))
+    return [np.int64(step).tobytes(), *(np.asarray(x).tobytes() for x in jax.tree.leaves(state))]

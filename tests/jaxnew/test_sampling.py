@@ -1,0 +1,325 @@
+"""Available sets: exactly uniform without replacement, and one program for every pool."""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy import stats
+
+from envs_mjx.grid_world import GridWorld, skill_universe
+from jaxnew import sampling
+from jaxnew.actions import random_halves_split
+from jaxnew.policy import make_method
+from jaxnew.rollout.device import DeviceRollout, RolloutConfig
+from jaxnew.sampling import ActionPool, check_set_size, draw_sets, whole_pool
+
+draw = jax.jit(draw_sets, static_argnames=("set_size", "padded_size"))
+
+# (members, capacity, set size). Both ways of drawing, far below, just below and at the whole pool:
+# rejection where 2 m <= capacity, sorting otherwise.
+REJECTION = [(6, 6, 3), (6, 16, 6), (40, 200, 39), (512, 1024, 50)]
+SORTING = [(6, 6, 4), (5, 7, 5), (40, 44, 30)]
+CASES = REJECTION + SORTING
+NUM_SETS = 20_000  # One draw per case serves all tests of it.
+
+
+def pool_of(size: int, capacity: int, always: tuple[int, ...] = ()) -> ActionPool:
+    """Members 3, 5, 7, ...: no member is an index into the pool's first rows by accident."""
+    return ActionPool.of(
+        3 + 2 * np.arange(size), capacity=capacity, always_available=np.array(always, np.int32)
+    )
+
+
+def keys_of(seed: int, count: int) -> jax.Array:
+    return jax.random.split(jax.random.key(seed), count)
+
+
+@functools.cache
+def draw_numpy(case: tuple[int, int, int]) -> np.ndarray:
+    """int[n, m] drawn sets, as member numbers 0..P-1."""
+    size, capacity, m = case
+    ids = np.asarray(draw(keys_of(1, NUM_SETS), pool_of(size, capacity), set_size=m).ids)
+    assert ids.shape == (NUM_SETS, m)
+    assert ((ids - 3) % 2 == 0).all()
+    members = (ids - 3) // 2
+    assert members.min() >= 0
+    assert members.max() < size
+    return members
+
+
+def assert_chi_square(statistic: float, degrees: int) -> None:
+    """Keys are fixed, so this is no lottery: a uniform sampler has two chances in a million to be
+    drawn with a key that fails. The lower bound catches counts that are too even to be random."""
+    low, high = stats.chi2.ppf(1e-6, degrees), stats.chi2.isf(1e-6, degrees)
+    assert low < statistic < high, f"chi-square {statistic:.1f} with {degrees} degrees"
+
+
+def multinomial_chi_square(counts: np.ndarray) -> float:
+    expected = counts.sum() / counts.size
+    assert expected >= 20  # The chi-square approximation holds.
+    return float(((counts - expected) ** 2).sum() / expected)
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", CASES)
+def test_members_are_distinct_and_from_the_pool(case: tuple[int, int, int]) -> None:
+    in_order = np.sort(draw_numpy(case), axis=1)
+    assert (np.diff(in_order, axis=1) > 0).all()
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", [c for c in CASES if c[2] < c[0]])
+def test_every_member_is_drawn_equally_often(case: tuple[int, int, int]) -> None:
+    """Counts of members over n sets have variance n p (1 - p), p = m / P, and correlation
+    -1 / (P - 1), so `(P - 1) / P * sum (count - n p)^2 / (n p (1 - p))` is chi-square, P - 1."""
+    size, _, m = case
+    counts = np.bincount(draw_numpy(case).reshape(-1), minlength=size)
+    p = m / size
+    variance = NUM_SETS * p * (1 - p)
+    statistic = (size - 1) / size * ((counts - NUM_SETS * p) ** 2).sum() / variance
+    assert_chi_square(statistic, size - 1)
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", [(6, 6, 3), (6, 6, 4)])
+def test_every_subset_is_drawn_equally_often(case: tuple[int, int, int]) -> None:
+    """The whole joint law: each of the C(P, m) subsets is one cell of a multinomial."""
+    size, _, m = case
+    drawn = np.sort(draw_numpy(case), axis=1)
+    codes = (drawn * size ** np.arange(m)).sum(axis=1)
+    _, counts = np.unique(codes, return_counts=True)
+    assert len(counts) == math.comb(size, m)
+    assert_chi_square(multinomial_chi_square(counts), len(counts) - 1)
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", [(40, 200, 39), (40, 44, 30)])
+def test_every_pair_is_drawn_equally_often(case: tuple[int, int, int]) -> None:
+    """One pair of slots per set, chosen independently of the draw, so that cells are multinomial
+    whatever order a set comes in."""
+    size = case[0]
+    members = draw_numpy(case)
+    slots = np.argsort(np.random.default_rng(0).random(members.shape), axis=1)[:, :2]
+    pairs = np.sort(np.take_along_axis(members, slots, axis=1), axis=1)
+    counts = np.bincount(pairs[:, 0] * size + pairs[:, 1], minlength=size**2)
+    counts = counts[[a * size + b for a, b in itertools.combinations(range(size), 2)]]
+    assert counts.sum() == NUM_SETS
+    assert_chi_square(multinomial_chi_square(counts), len(counts) - 1)
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", [(6, 16, 6), (5, 7, 5)])
+def test_the_whole_pool_is_drawn_when_the_set_is_as_large(case: tuple[int, int, int]) -> None:
+    assert (np.sort(draw_numpy(case), axis=1) == np.arange(case[0])).all()
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("case", [(40, 100, 30), (40, 44, 30)])
+def test_a_set_depends_on_its_key_alone(case: tuple[int, int, int]) -> None:
+    size, capacity, m = case
+    keys, pool = keys_of(6, 24), pool_of(size, capacity)
+    together = np.asarray(draw(keys, pool, set_size=m).ids)
+    assert np.array_equal(together, np.asarray(draw(keys, pool, set_size=m).ids))
+    assert np.array_equal(together[::-1], np.asarray(draw(keys[::-1], pool, set_size=m).ids))
+    one = np.asarray(draw(keys[5], pool, set_size=m).ids)
+    assert np.array_equal(together[5], one)
+    few = np.asarray(draw(keys[5:9].reshape(2, 2), pool, set_size=m).ids)
+    assert np.array_equal(together[5:9].reshape(2, 2, m), few)
+    # Different keys give different sets.
+    assert len({frozenset(row) for row in together.tolist()}) == 24
+
+
+@pytest.mark.unit
+def test_padding_repeats_valid_ids_and_is_masked() -> None:
+    pool = pool_of(6, 6)
+    bare = draw(keys_of(7, 50), pool, set_size=4, padded_size=4)
+    assert np.asarray(bare.mask).all()
+    padded = draw(keys_of(7, 50), pool, set_size=4, padded_size=7)
+    assert padded.ids.shape == padded.mask.shape == (50, 7)
+    assert padded.ids.dtype == jnp.int32
+    assert padded.mask.dtype == bool
+    # The set itself is the one drawn without padding.
+    assert np.array_equal(padded.ids[:, :4], bare.ids)
+    assert (np.asarray(padded.mask) == [True] * 4 + [False] * 3).all()
+    ids = np.asarray(padded.ids)
+    assert all(set(row[4:]) <= set(row[:4]) for row in ids.tolist())
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("capacity", [14, 30])  # Sorting and rejection.
+def test_always_available_actions_stand_first_and_are_not_drawn_again(capacity: int) -> None:
+    """Spec method 2.2, CREATE: the no-op is removed from the pool and put into slot 0."""
+    always = (5, 9)  # 9 is offered as a member too; 5 as well.
+    pool = pool_of(14, capacity, always)
+    assert int(pool.size) == 12
+    drawn = draw(keys_of(8, 400), pool, set_size=10, padded_size=12)
+    ids = np.asarray(drawn.ids)
+    assert (ids[:, :2] == always).all()
+    assert not np.isin(ids[:, 2:10], always).any()
+    assert (np.diff(np.sort(ids[:, :10], axis=1), axis=1) > 0).all()
+    assert np.array_equal(np.unique(ids[:, 2:10]), np.setdiff1d(3 + 2 * np.arange(14), always))
+    assert (np.asarray(drawn.mask) == [True] * 10 + [False] * 2).all()
+    # 8 of 12 members in each set: the count of each is binomial-like, deviation below
+    # sqrt(400 * 2/3 * 1/3) = 9.4; five of them.
+    counts = np.bincount(ids[:, 2:10].reshape(-1))
+    assert np.abs(counts[counts > 0] - 400 * 8 / 12).max() < 47
+
+
+@pytest.mark.unit
+def test_one_program_serves_pools_of_every_size() -> None:
+    split = random_halves_split(skill_universe(), seed=0)
+    num_traces = 0
+
+    @jax.jit
+    def counted(keys: jax.Array, pool: ActionPool) -> jax.Array:
+        nonlocal num_traces
+        num_traces += 1
+        return draw_sets(keys, pool, 50).ids
+
+    for name in ("train", "validation", "test", "all"):
+        ids = np.asarray(
+            counted(keys_of(9, 40), ActionPool.of(split.ids(name), capacity=1024)).tolist()
+        )
+        assert np.isin(ids, split.ids(name)).all()
+        assert all(len(set(row)) == 50 for row in ids.tolist())
+    assert num_traces == 1
+
+
+@pytest.mark.unit
+def test_a_pool_holds_its_members_and_valid_padding() -> None:
+    pool = ActionPool.of(np.array([7, 2, 9]), capacity=5)
+    assert int(pool.size) == 3
+    assert sorted(pool.ids[:3].tolist()) == [2, 7, 9]
+    assert set(pool.ids.tolist()) == {2, 7, 9}
+    assert pool.ids.shape == (5,)
+    assert pool.always_available.shape == (0,)
+    exact = ActionPool.of(np.array([7, 2, 9]), capacity=3)
+    assert sorted(exact.ids.tolist()) == [2, 7, 9]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("ids", "always", "message"),
+    [
+        ([], [], "at least one"),
+        ([4, 4], [], "distinct"),
+        ([4], [4], "at least one"),
+        ([1, 2, 3, 4], [], "4 ids do not fit a pool of capacity 3"),
+    ],
+)
+def test_bad_pools_are_refused(ids: list[int], always: list[int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        ActionPool.of(np.array(ids, np.int32), capacity=3, always_available=np.array(always))
+
+
+@pytest.mark.unit
+def test_a_pool_beyond_the_range_of_the_draw_is_refused() -> None:
+    """`_random_below` is right up to 2**16 members; beyond, the last are never drawn."""
+    assert ActionPool.of(np.arange(2**16), capacity=2**16).size == 2**16
+    with pytest.raises(ValueError, match="65"):
+        ActionPool.of(np.arange(2**16 + 1), capacity=2**16 + 1)
+
+
+@pytest.mark.unit
+def test_check_set_size_says_what_fits() -> None:
+    plain, with_always = pool_of(6, 16), pool_of(6, 16, (100, 101))
+    for pool, sizes in ((plain, (1, 6)), (with_always, (3, 8))):
+        assert all(check_set_size(pool, size) is None for size in sizes)
+    with pytest.raises(ValueError, match=r"Sets of 7 .*test actions.* 6 \(0 .*1\.\.6"):
+        check_set_size(plain, 7, "the test actions")
+    with pytest.raises(ValueError, match=r"Sets of 0 .*1\.\.6"):
+        check_set_size(plain, 0)
+    with pytest.raises(ValueError, match=r"Sets of 9 .* 8 \(2 .*3\.\.8"):
+        check_set_size(with_always, 9)
+    # Nothing would be drawn.
+    with pytest.raises(ValueError, match=r"Sets of 2 .*3\.\.8"):
+        check_set_size(with_always, 2)
+
+
+@pytest.mark.unit
+def test_whole_pool_has_every_member_once() -> None:
+    available = whole_pool(pool_of(6, 9, (100,)))
+    assert available.ids.shape == available.mask.shape == (10,)
+    real = available.ids[available.mask].tolist()
+    assert sorted(real) == [3, 5, 7, 9, 11, 13, 100]
+    assert real[0] == 100
+    assert set(available.ids.tolist()) == set(real)
+
+
+@pytest.mark.property
+@settings(max_examples=200, deadline=None)
+@given(
+    bits=st.lists(
+        st.sampled_from([0, 1, 0xFFFF, 0x10000, 0xFFFF0000, 0xFFFFFFFE, 0xFFFFFFFF])
+        | st.integers(0, 2**32 - 1),
+        min_size=8,
+        max_size=8,
+    ),
+    bound=st.sampled_from([1, 2, 3, 50, 512, 10_000, 2**16 - 1, 2**16]) | st.integers(1, 2**16),
+)
+def test_random_below_is_the_scaled_word(bits: list[int], bound: int) -> None:
+    """floor(bits * bound / 2**32) exactly: in 0..bound-1 and monotone, so every value has
+    floor(2**32 / bound) or one more words that lead to it."""
+    words = jnp.asarray(np.array(bits, np.uint32))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(jax.random, "bits", lambda *_args, **_kwargs: words)
+        got = sampling._random_below(jax.random.key(0), (8,), jnp.int32(bound))
+    assert got.dtype == jnp.int32
+    assert got.tolist() == [word * bound >> 32 for word in bits]
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("split_name", ["train", "validation"])
+def test_grid_world_sets_are_new_at_each_reset(split_name: str) -> None:
+    """Spec grid_world 9, check 18: 50 distinct ids of the requested split, new at each reset."""
+    ids, done = collect_grid_world_sets(split_name)
+    allowed = random_halves_split(skill_universe(), seed=0).ids(split_name)
+    num_steps, num_envs, m = ids.shape
+    assert m == 50
+    assert np.isin(ids, allowed).all()
+    assert (np.diff(np.sort(ids, axis=-1), axis=-1) > 0).all()
+    assert done.sum() > 20
+    # The set changes at the ends and only there.
+    has_changed = (ids[1:] != ids[:-1]).any(axis=-1)
+    assert np.array_equal(has_changed, done[:-1])
+    # No set is ever met again: 50 of 256 or more, in any order.
+    sets = {
+        (env, frozenset(ids[t, env].tolist())) for env in range(num_envs) for t in range(num_steps)
+    }
+    assert len(sets) == num_envs + done[:-1].sum()
+    assert len({members for _, members in sets}) == len(sets)
+
+
+def collect_grid_world_sets(split_name: str) -> tuple[np.ndarray, np.ndarray]:
+    """(ids int[T, N, 50], done bool[T, N]) of two rollouts in a row."""
+    rollout, collect = grid_world_rollout()
+    split = random_halves_split(skill_universe(), seed=0)
+    pool = ActionPool.of(split.ids(split_name), capacity=1024)
+    state = rollout.init(jax.random.key(10), pool)
+    params = rollout.method.init(jax.random.key(11), state.observation[0], 3)
+    table = jax.random.normal(jax.random.key(12), (1024, 3))
+    batches = []
+    for seed in (13, 14):
+        key = jax.random.key(seed)
+        state, batch, _ = collect(key, state, params, table, pool, jnp.float32(0.99))
+        batches.append((np.asarray(batch.available.ids), np.asarray(batch.done)))
+    # One program for all splits.
+    assert collect._cache_size() == 1
+    return tuple(np.concatenate(parts) for parts in zip(*batches, strict=True))
+
+
+@functools.cache
+def grid_world_rollout() -> tuple[DeviceRollout, Any]:
+    env = GridWorld()
+    config = RolloutConfig(num_envs=6, num_steps=30)
+    rollout = DeviceRollout(env, env.default_params, make_method("ours"), config)
+    return rollout, jax.jit(rollout.collect)
