@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from jaxnew import loop, observations
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.observations import ActionObservations
+from jaxnew.representation import report
 from jaxnew.representation.learner import (
     Modality,
     RepresentationConfig,
@@ -229,3 +231,16 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
         table = RepresentationTable.load(run.path / TABLE_FILE)
     table.check(domain.universe, domain.split)
     return table
+
+
+def print_report(domain: Domain, run: RunDirectory, table: RepresentationTable) -> None:
+    """Purity, linear R2 and statistics of a table (spec method 3.8), also as JSON in the run."""
+    targets = domain.task.representation_targets
+    numbers = report.describe(
+        table.vectors,
+        domain.universe.class_labels,
+        held_out=sorted({*domain.split.validation.tolist(), *domain.split.test.tolist()}),
+        targets=targets(domain.universe) if targets else {},
+    )
+    run.record_evaluation("representation", numbers)
+    print(f"{run.path / TABLE_FILE}: {json.dumps(numbers, indent=2)}")

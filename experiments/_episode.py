@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
 from jaxnew.ppo import TrainState
-from jaxnew.sampling import draw_sets
+from jaxnew.sampling import ActionPool, draw_sets
 
 DRAWN_TASK = "grid_world"
 
@@ -55,49 +55,61 @@ def play_episodes(
       first, count: numbers of the episodes; inference runs at the evaluator's width.
       seed: of the evaluation.
     """
-    evaluator = trainer.evaluator
+    width = trainer.evaluator.width
+    programs = _programs(trainer, state, seed)
     episodes: list[Episode] = []
-    for start in range(first // evaluator.width * evaluator.width, first + count, evaluator.width):
-        block = _play_block(trainer, state, split, jnp.arange(evaluator.width) + start, seed)
-        episodes += [e for e in block if first <= e.number < first + count]
-    return episodes
+    for start in range(first, first + count, width):
+        episodes += _play_block(trainer, programs, split, jnp.arange(start, start + width))
+    return episodes[:count]
 
 
-def _play_block(
-    trainer: Trainer, state: TrainState, split: str, numbers: jax.Array, seed: int
-) -> list[Episode]:
-    """The evaluator's episodes `numbers`, with every state kept. Keys as in `play_block`."""
+def _programs(trainer: Trainer, state: TrainState, seed: int) -> tuple[Any, Any]:
+    """The start of a block of episodes and one step of it, with the keys of `Evaluator`."""
     evaluator, method = trainer.evaluator, trainer.evaluator.method
     env, env_params = evaluator.env, evaluator.env_params
-    key = jax.random.key(seed)
-    keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(numbers)
-    available = draw_sets(
-        keys[:, 0], trainer.pools[split], evaluator.set_size, evaluator.padded_set_size or None
-    )
-    projected = method.project(state.params, trainer.table)[available.ids]
+    padded_size = evaluator.padded_set_size or None
     statistics = state.rollout.observation_statistics
 
     @jax.jit
-    def step(obs: jax.Array, env_state: Any, t: jax.Array) -> tuple[Any, ...]:
+    def start(pool: ActionPool, numbers: jax.Array) -> tuple[Any, Any]:
+        key = jax.random.key(seed)
+        keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(numbers)
+        available = draw_sets(keys[:, 0], pool, evaluator.set_size, padded_size)
+        obs, env_state = jax.vmap(env.reset_env, in_axes=(0, None))(keys[:, 1], env_params)
+        projected = method.project(state.params, trainer.table)[available.ids]
+        return (keys[:, 2], available, projected), (obs, env_state)
+
+    @jax.jit
+    def step(fixed: Any, carry: Any, t: jax.Array) -> tuple[Any, ...]:
+        (keys, available, projected), (obs, env_state) = fixed, carry
         if evaluator.normalize_observations:
             obs = statistics.normalize(obs)
         distribution = method.distribution(state.params, obs, projected, available.mask)
-        keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys[:, 2])
+        keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys)
         sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
         action = method.decode(sample, available)
         obs, env_state, reward, terminated, truncated, info = jax.vmap(
             env.step_env, in_axes=(0, 0, 0, None)
         )(keys_now[:, 1], env_state, action, env_params)
-        return obs, env_state, action.id, reward, terminated | truncated, info["is_success"]
+        return (obs, env_state), action.id, reward, terminated | truncated, info["is_success"]
 
-    obs, env_state = jax.vmap(env.reset_env, in_axes=(0, None))(keys[:, 1], env_params)
-    states, steps = [jax.device_get(env_state)], []
-    for t in range(env.max_episode_steps(env_params)):
-        obs, env_state, *outcome = step(obs, env_state, jnp.int32(t))
-        states.append(jax.device_get(env_state))
+    return start, step
+
+
+def _play_block(
+    trainer: Trainer, programs: tuple[Any, Any], split: str, numbers: jax.Array
+) -> list[Episode]:
+    """The evaluator's episodes `numbers`, with every state kept."""
+    evaluator = trainer.evaluator
+    start, step = programs
+    fixed, carry = start(trainer.pools[split], numbers)
+    states, steps = [jax.device_get(carry[1])], []
+    for t in range(evaluator.env.max_episode_steps(evaluator.env_params)):
+        carry, *outcome = step(fixed, carry, jnp.int32(t))
+        states.append(jax.device_get(carry[1]))
         steps.append([np.asarray(values) for values in outcome])
     ids, rewards, done, is_success = (np.stack(values) for values in zip(*steps, strict=True))
-    sets = np.asarray(available.ids)[:, : evaluator.set_size]
+    sets = np.asarray(fixed[1].ids)[:, : evaluator.set_size]
     episodes = []
     for row, number in enumerate(np.asarray(numbers)):
         length = 1 + int(np.argmax(done[:, row]))  # The time limit ends every episode.

@@ -62,7 +62,7 @@ class ResultRow:
     paper_num_seeds: int | None
     paper_steps: float | None
     difference: float | None
-    runs: str
+    runs: tuple[str, ...]
 
     @property
     def is_standard(self) -> bool:
@@ -130,7 +130,7 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
         paper_num_seeds=paper.num_seeds if paper else None,
         paper_steps=paper_steps(str(group.task.paper_environment)) if paper else None,
         difference=scale * (mean - paper.mean) if paper else None,
-        runs=" ".join(str(run.path) for run in runs),
+        runs=tuple(str(run.path) for run in runs),
     )
 
 
@@ -148,11 +148,11 @@ def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
 
 
 def as_csv(rows: Sequence[ResultRow]) -> str:
-    """The rows with all fields; an unknown number is empty."""
+    """The rows with all fields; an unknown number is empty, `;` stands between several runs."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [f.name for f in fields(ResultRow)], lineterminator="\n")
     writer.writeheader()
-    writer.writerows(asdict(row) for row in rows)
+    writer.writerows({**asdict(row), "runs": ";".join(row.runs)} for row in rows)
     return text.getvalue()
 
 
@@ -193,7 +193,7 @@ def _cells(row: ResultRow, metric: Metric) -> list[str]:
     actions = f"{row.actions}, sets of {row.set_size}"
     episodes = f"{row.num_episodes:,}"
     cells = [row.setting, actions, policy, ours, paper, difference, seeds, episodes, steps]
-    return [*cells, row.runs.replace(" ", "<br>")]
+    return [*cells, "<br>".join(row.runs)]
 
 
 def _line(cells: Sequence[str]) -> str:

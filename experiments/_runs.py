@@ -160,8 +160,7 @@ def _read_run(path: Path) -> Run:
     if "representation" not in config or not ("ppo" in config or "model" in config):
         raise UsageError(f"{path} is no run of train, sweep or embed, so there is nothing to draw.")
     has_inputs = (path / TABLE_FILE).exists() and (path / SPLIT_FILE).exists()
-    files = sorted((path / "evaluation").glob("*.json"))
-    evaluations = [json.loads(file.read_text(encoding="utf-8")) for file in files]
+    evaluations = [_read_evaluation(file) for file in sorted(path.glob("evaluation/*.json"))]
     return Run(
         path=path,
         config=config,
@@ -170,6 +169,13 @@ def _read_run(path: Path) -> Run:
         table=RepresentationTable.load(path / TABLE_FILE) if has_inputs else None,
         split=ActionSplit.load(path / SPLIT_FILE) if has_inputs else None,
     )
+
+
+def _read_evaluation(file: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(file.read_text(encoding="utf-8")))
+    except ValueError as err:
+        raise UsageError(f"{file} is damaged ({err}); delete it and evaluate again.") from err
 
 
 def group_runs(runs: Sequence[Run]) -> list[Group]:

@@ -14,11 +14,16 @@ import jax.numpy as jnp
 
 from experiments import _flags as flag
 from experiments import figures
-from experiments._artifacts import TABLE_FILE, Domain, find_table, train_representation
+from experiments._artifacts import (
+    TABLE_FILE,
+    Domain,
+    find_table,
+    print_report,
+    train_representation,
+)
+from experiments._evaluation import evaluate_on, record
 from experiments._paper import paper_value
 from experiments._training import load_state, load_trainer, train_policy
-from experiments.embed import print_report
-from experiments.evaluate import evaluate_on, record
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 

@@ -9,7 +9,6 @@ existed before into representations (paper algorithm 2).
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 from absl import flags
@@ -20,12 +19,11 @@ from experiments._artifacts import (
     TABLE_FILE,
     Domain,
     load_encoder,
+    print_report,
     train_representation,
 )
 from jaxnew import observations
-from jaxnew.representation import report
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run_directory import RunDirectory
 
 CHECKPOINT = flags.DEFINE_string("checkpoint", None, "Run directory of a trained encoder.")
 OBSERVATIONS = flags.DEFINE_string("observations", None, ".npz of ids and recordings to encode.")
@@ -60,19 +58,6 @@ def train() -> None:
     if (run.path / TABLE_FILE).exists():
         table = RepresentationTable.load(run.path / TABLE_FILE)
         print_report(domain, run, table)
-
-
-def print_report(domain: Domain, run: RunDirectory, table: RepresentationTable) -> None:
-    """Purity, linear R2 and statistics of a table (spec method 3.8), also as JSON in the run."""
-    targets = domain.task.representation_targets
-    numbers = report.describe(
-        table.vectors,
-        domain.universe.class_labels,
-        held_out=sorted({*domain.split.validation.tolist(), *domain.split.test.tolist()}),
-        targets=targets(domain.universe) if targets else {},
-    )
-    run.record_evaluation("representation", numbers)
-    print(f"{run.path / TABLE_FILE}: {json.dumps(numbers, indent=2)}")
 
 
 def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None:

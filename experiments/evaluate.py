@@ -9,7 +9,6 @@ python -m experiments.evaluate --run=RUN --unseen_ratio=0.4
 from __future__ import annotations
 
 import dataclasses
-import time
 from pathlib import Path
 from typing import Any
 
@@ -19,13 +18,10 @@ import numpy as np
 from absl import flags
 
 from experiments import _flags as flag
-from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
+from experiments._evaluation import evaluate_on, record
+from experiments._training import EVALUATION_SEED, load_state, load_trainer
 from jaxnew.actions import ActionSplit, ActionUniverse, load_ids, mixture_ids
-from jaxnew.evaluation import summarize
-from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run_directory import RunDirectory
-from jaxnew.sampling import ActionPool
 
 RUN = flags.DEFINE_string("run", None, "Run directory of train, or a checkpoint in it.")
 CHECKPOINT = flags.DEFINE_enum("checkpoint", "best", ["best", "latest"], "Which checkpoint.")
@@ -109,46 +105,6 @@ def with_new_rows(table: jax.Array, new: RepresentationTable) -> jax.Array:
             f"ids 0..{table.shape[0] - 1}."
         )
     return table.at[jnp.asarray(new.ids)].set(jnp.asarray(new.vectors))
-
-
-def evaluate_on(
-    trainer: Trainer,
-    state: TrainState,
-    ids: np.ndarray,
-    split: ActionSplit,
-    *,
-    num_episodes: int,
-    deterministic: bool = False,
-    seed: int = EVALUATION_SEED,
-) -> dict[str, Any]:
-    """Episodes on sets drawn from `ids`: metrics with intervals over episodes."""
-    start = time.perf_counter()
-    episodes = trainer.evaluator.run(
-        state.params,
-        state.rollout.observation_statistics,
-        trainer.table,
-        ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available),
-        jax.random.key(seed),
-        num_episodes,
-        deterministic,
-    )
-    return {
-        "metrics": summarize(episodes),
-        "num_episodes": num_episodes,
-        "num_actions": len(ids),
-        "set_size": trainer.evaluator.set_size,
-        "policy": "greedy" if deterministic else "sampled",
-        "evaluation_seed": seed,
-        "seconds": round(time.perf_counter() - start, 2),
-    }
-
-
-def record(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, Any]) -> None:
-    """Keeps one result in the run directory."""
-    run.record_evaluation(
-        f"{name}-{kind}-{row['policy']}-m{row['set_size']}",
-        {"checkpoint": kind, "step": step, "actions": name, **row},
-    )
 
 
 def print_table(rows: dict[str, dict[str, Any]], title: str) -> None:

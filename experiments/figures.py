@@ -65,11 +65,10 @@ def main() -> None:
     out = Path(values.out) if values.out else Path(values.run[0] if paths else ".") / "figures"
     files = make_figures(paths, out, pdf=values.pdf)
     if values.episode:
-        files += [
-            file
-            for run in read_runs(paths)[:1]
-            for file in episode_animation(run.path, out / "zero_shot_episode.gif")
-        ]
+        policies = [run for run in read_runs(paths) if run.is_policy]
+        if not policies:
+            raise flag.UsageError("--episode needs a run of train; the runs given are of embed.")
+        files += episode_animation(policies[0].path, out / "zero_shot_episode.gif")
     for file in files:
         print(file)
 
@@ -120,8 +119,8 @@ def setting_colors(groups: Sequence[Group]) -> list[Color]:
     left = [i for i in (1, 6, 8, 0, 2, 9, 4, 7, 5, 3) if i not in wanted]
     chosen: list[int] = []
     for index in wanted:
-        free = index is not None and index not in chosen
-        chosen.append(index if free and index is not None else (left.pop(0) if left else 1))
+        is_free = index is not None and index not in chosen
+        chosen.append(index if index is not None and is_free else left.pop(0) if left else 1)
     return [palette[index] for index in chosen]
 
 
@@ -241,7 +240,7 @@ def missing_evaluations(groups: Sequence[Group], rows: dict[str, list[ResultRow]
             lacking = [
                 split
                 for split in BAR_SPLITS
-                if split not in standard or str(run.path) not in standard[split].runs.split(" ")
+                if split not in standard or str(run.path) not in standard[split].runs
             ]
             if lacking:
                 lines.append(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -59,16 +60,26 @@ def collect_into(
         raise ObservationsError(
             f"{path} is not empty and has no {MANIFEST}. Choose another directory."
         )
-    try:
-        lock = take_lock(path / ".lock")
-    except BlockingIOError as err:
-        raise ObservationsError(f"{path} is being collected by another process ({err}).") from err
+    lock = _wait_for_lock(path)
     try:
         _Collection(path, format, ids, num_recordings, settings).run(
             record_block, seed, min(block_actions, len(ids))
         )
     finally:
         os.close(lock)
+
+
+def _wait_for_lock(path: Path) -> int:
+    """The lock of a recording directory, once no other process collects there."""
+    is_announced = False
+    while True:
+        try:
+            return take_lock(path / ".lock")
+        except BlockingIOError as err:
+            if not is_announced:
+                print(f"Waiting for another process that collects in {path} ({err}).", flush=True)
+                is_announced = True
+            time.sleep(0.5)
 
 
 def _settings(

@@ -61,8 +61,9 @@ def collect(
 ) -> ActionObservations:
     """Records actions into the directory `path`; goes on where an earlier call was killed.
 
-    Says how large the result will be, and shows progress. Calling it again when everything is
-    recorded only checks the recordings; damaged ones are made again.
+    Says how large the result will be, and shows progress. Where another process collects there, it
+    waits. Calling it again when everything is recorded only checks the recordings; damaged ones are
+    made again.
 
     Args:
       record_block: `(seed, ids int32[n], num_recordings) -> [n, num_recordings, *format.shape]`,
@@ -74,8 +75,8 @@ def collect(
       play_settings: plain JSON; whatever else fixes the recordings, e.g. environment parameters.
 
     Raises:
-      ObservationsError: `path` holds something else or recordings with other settings, another
-        process collects there, the disk is too small, or `record_block` broke its promise.
+      ObservationsError: `path` holds something else or recordings with other settings, the disk is
+        too small, or `record_block` broke its promise.
     """
     collect_into(
         Path(path),

@@ -119,18 +119,18 @@ def bandit(reward: np.ndarray, observations: np.ndarray) -> TableParams:
     )
 
 
-def ladder(num_actions: int, num_rungs: int = 12, time_limit: int = 5) -> TableParams:
+def ladder(num_actions: int, num_rungs: int = 10, time_limit: int = 4) -> TableParams:
     """Deterministic but for the policy: action `a` climbs `1 + a % 4` rungs from rung 0.
 
     The top terminates, `time_limit` steps truncate, and both happen often. Rewards are irregular
-    numbers of both signs. Observation: (rung, its square / 10, an arbitrary number, 7 always).
+    numbers of both signs. Observation: (rung, its square / 10, an arbitrary number, 1 always).
     """
     rung = np.arange(num_rungs + 1)[:, None]
     action = np.arange(num_actions)[None]
     next_state = np.minimum(rung + 1 + action % 4, num_rungs)
     rng = np.random.default_rng(5)
     observations = np.column_stack(
-        [rung[:, 0], rung[:, 0] ** 2 / 10, rng.normal(size=num_rungs + 1), 0 * rung[:, 0] + 7]
+        [rung[:, 0], rung[:, 0] ** 2 / 10, rng.normal(size=num_rungs + 1), 0 * rung[:, 0] + 1]
     )
     return table_params(
         observations,

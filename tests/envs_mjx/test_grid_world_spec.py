@@ -271,9 +271,9 @@ def test_16_random_policy() -> None:
     assert abs(is_dead.mean() - 0.857) <= 0.006
     assert abs(last["has_reached_subgoal"].mean() - 0.126) <= 0.006
     assert abs(last["episode_return"].mean() - 0.0136) <= 0.001
-    # Spec 6 prints 22.7, that is +-0.05; 40,000 lengths of deviation 15 have a standard error of
-    # 0.075, theirs the same: 0.05 + 4 * 0.075 * sqrt(2).
-    assert abs(last["episode_length"].mean() - 22.7) <= 0.47
+    # Spec 6 prints 22.7, that is +-0.05; 40,000 lengths of deviation 16 have a standard error of
+    # 0.08, theirs the same: 0.05 + 4 * 0.08 * sqrt(2).
+    assert abs(last["episode_length"].mean() - 22.7) <= 0.5
 
 
 def test_17_play_data() -> None:

@@ -10,6 +10,7 @@ import random
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -351,16 +352,22 @@ def test_too_small_a_disk_is_said_before_recording(
 
 
 @pytest.mark.unit
-def test_one_process_collects_at_a_time(tmp_path: Path) -> None:
-    gather(tmp_path)
-    lock = take_lock(tmp_path / ".lock")
+def test_one_process_collects_at_a_time(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "busy").mkdir()
+    lock = take_lock(tmp_path / "busy" / ".lock")
     try:
-        with pytest.raises(ObservationsError, match=f"another process .process {os.getpid()}"):
-            gather(tmp_path)
-        load(tmp_path, make_universe())
+        second = threading.Thread(target=gather, args=(tmp_path / "busy",))
+        second.start()
+        time.sleep(0.3)
+        assert second.is_alive(), "it waits"
+        assert not (tmp_path / "busy" / "manifest.json").exists()
     finally:
         os.close(lock)
-    gather(tmp_path)
+    second.join(20)
+    load(tmp_path / "busy", make_universe())
+    assert f"Waiting for another process that collects in {tmp_path / 'busy'}" in (
+        capsys.readouterr().out
+    )
 
 
 @pytest.mark.unit

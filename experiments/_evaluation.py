@@ -1,0 +1,56 @@
+"""Evaluations as `evaluate` and `demo` make and keep them."""
+
+from __future__ import annotations
+
+import time
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments._training import EVALUATION_SEED, Trainer
+from jaxnew.actions import ActionSplit
+from jaxnew.evaluation import summarize
+from jaxnew.ppo import TrainState
+from jaxnew.run_directory import RunDirectory
+from jaxnew.sampling import ActionPool
+
+
+def evaluate_on(
+    trainer: Trainer,
+    state: TrainState,
+    ids: np.ndarray,
+    split: ActionSplit,
+    *,
+    num_episodes: int,
+    deterministic: bool = False,
+    seed: int = EVALUATION_SEED,
+) -> dict[str, Any]:
+    """Episodes on sets drawn from `ids`: metrics with intervals over episodes."""
+    start = time.perf_counter()
+    episodes = trainer.evaluator.run(
+        state.params,
+        state.rollout.observation_statistics,
+        trainer.table,
+        ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available),
+        jax.random.key(seed),
+        num_episodes,
+        deterministic,
+    )
+    return {
+        "metrics": summarize(episodes),
+        "num_episodes": num_episodes,
+        "num_actions": len(ids),
+        "set_size": trainer.evaluator.set_size,
+        "policy": "greedy" if deterministic else "sampled",
+        "evaluation_seed": seed,
+        "seconds": round(time.perf_counter() - start, 2),
+    }
+
+
+def record(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, Any]) -> None:
+    """Keeps one result in the run directory."""
+    run.record_evaluation(
+        f"{name}-{kind}-{row['policy']}-m{row['set_size']}",
+        {"checkpoint": kind, "step": step, "actions": name, **row},
+    )

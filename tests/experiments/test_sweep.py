@@ -1,0 +1,78 @@
+"""Members of a sweep are the single runs they stand for."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+
+from experiments._artifacts import Domain
+from experiments._flags import UsageError, load_task
+from experiments._training import TrainConfig
+from experiments.sweep import member_configs, parse_seeds
+from jaxnew.representation.table import engineered_table
+from tests.experiments.commands import ROOT
+
+
+@pytest.fixture(scope="module")
+def base() -> TrainConfig:
+    domain = Domain.of(load_task("grid_world"), None)
+    table = engineered_table(domain.universe, "gt12")
+    return TrainConfig.of(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
+
+
+@pytest.mark.integration
+def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
+    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.experiments.sweep_on_devices"],
+        cwd=ROOT,
+        env={**os.environ, "XLA_FLAGS": flags},
+        capture_output=True,
+        text=True,
+        timeout=400,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout.splitlines()[-1])
+    assert found["devices"] == found["devices_of_a_leaf"] == 8
+    # Adam moves a weight by at most about 1e-3 per gradient step, 16 of them here; the same sums in
+    # another order differ by float32 rounding, which Adam's division can magnify where a gradient
+    # is almost zero.
+    assert found["moved"] > 1e-3
+    assert found["largest_difference"] < 1e-4
+    assert found["seven_members_on_six_devices_use"] == 1
+
+
+@pytest.mark.unit
+def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
+    vary = ["entropy_coefficient=0.0,0.1", "clip=0.1,0.2,0.3"]
+    members = member_configs(base, [1, 2], vary)
+    found = {
+        (m.seed, m.hyperparameters.entropy_coefficient, m.hyperparameters.clip) for m in members
+    }
+    assert len(members) == len(found) == 2 * 2 * 3
+    assert (2, 0.1, 0.3) in found
+    assert all(m.hyperparameters.discount == base.hyperparameters.discount for m in members)
+    # Twelve members share the cache: 256 / 8 = 32 transitions at a time for each.
+    assert {m.ppo.microbatch_size for m in members} == {32}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("vary", "says"),
+    [("entropy=0.1", "entropy_coefficient"), ("clip=a", "name=value"), ("clip", "name=value")],
+)
+def test_bad_axes_are_refused(base: TrainConfig, vary: str, says: str) -> None:
+    with pytest.raises(UsageError, match=says):
+        member_configs(base, [1], [vary])
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("seeds", [["1", "x"], ["1", "1"], []])
+def test_bad_seeds_are_refused(seeds: list[str]) -> None:
+    with pytest.raises(UsageError, match="seeds"):
+        parse_seeds(seeds)

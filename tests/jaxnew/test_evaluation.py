@@ -1,0 +1,259 @@
+"""Evaluation: known episodes, frozen statistics, numbers that do not depend on what runs beside."""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import special, stats
+
+from envs_mjx.grid_world import GridWorld, skill_universe
+from jaxnew.actions import random_halves_split
+from jaxnew.evaluation import Evaluator, summarize
+from jaxnew.policy import make_method
+from jaxnew.rollout.normalization import RunningStatistics
+from jaxnew.sampling import ActionPool
+from tests import probe_environments as probe
+from tests.jaxnew.policy import numpy_policy
+
+A, D = 24, 3
+METHOD = make_method("ours")
+TABLE = np.random.default_rng(0).normal(size=(A, D)).astype(np.float32)
+LADDER = probe.ladder(A)
+STATISTICS = RunningStatistics(
+    jnp.array([3.0, 2.0, 0.1, 1.0]), jnp.array([9.0, 4.0, 1.0, 0.0]), jnp.float32(100.0)
+)
+KEY = jax.random.key(7)
+num_traces = 0
+
+
+class CountedWorld(probe.TableWorld):
+    """Counts how often it is traced."""
+
+    def reset_env(self, key: jax.Array, params: Any) -> Any:
+        global num_traces
+        num_traces += 1
+        return super().reset_env(key, params)
+
+
+@functools.cache
+def evaluator_of(set_size: int, width: int = 4) -> Evaluator:
+    return Evaluator(
+        CountedWorld(A), LADDER, METHOD, set_size=set_size, padded_set_size=5, width=width
+    )
+
+
+@functools.cache
+def params() -> Any:
+    shapes = METHOD.init(jax.random.key(0), jnp.zeros(4), D)
+    return numpy_policy.randomized(shapes, seed=1)
+
+
+def pool_of(ids: list[int] | np.ndarray) -> ActionPool:
+    return ActionPool.of(np.asarray(ids), capacity=A)
+
+
+def run(set_size: int, ids: list[int] | np.ndarray, num_episodes: int, **options: Any) -> Any:
+    width = options.pop("width", 4)
+    key = options.pop("key", KEY)
+    return evaluator_of(set_size, width).run(
+        params(), STATISTICS, TABLE, pool_of(ids), key, num_episodes, **options
+    )
+
+
+def known_episode(choose: Any) -> dict[str, float]:
+    """The ladder climbed in NumPy; `choose` maps (rung) to an id."""
+    rung, total, next_state = 0, 0.0, np.asarray(LADDER.next_state)
+    for step in range(1, int(LADDER.time_limit) + 1):
+        action_id = choose(rung)
+        reward = float(LADDER.reward[rung, action_id])
+        total += reward
+        is_over = bool(LADDER.terminates[rung, action_id])
+        rung = int(next_state[rung, action_id])
+        if is_over:
+            break
+    return {
+        "is_success": float(reward > 0),
+        "episode_return": total,
+        "final_state": float(rung),
+        "num_steps": float(step),
+    }
+
+
+def assert_episodes(got: dict[str, np.ndarray], expected: dict[str, float], count: int) -> None:
+    assert set(got) == set(expected)
+    for name, values in got.items():
+        assert values.shape == (count,)
+        np.testing.assert_allclose(values, expected[name], rtol=1e-5, err_msg=name)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("deterministic", [False, True])
+def test_metrics_are_those_at_the_end_of_the_episode(deterministic: bool) -> None:
+    """With one action to choose from, an episode is known. Action 3 climbs 4 rungs a step and is at
+    the top after 3, where the evaluation goes on stepping until others have ended; action 0 climbs
+    one and is stopped by the time limit of 4."""
+    lengths = set()
+    for action_id in range(8):
+        expected = known_episode(lambda _, action_id=action_id: action_id)
+        lengths.add(expected["num_steps"])
+        got = run(1, [action_id], 3, deterministic=deterministic)
+        assert_episodes(got, expected, 3)
+    assert lengths == {3.0, 4.0}
+
+
+@pytest.mark.oracle
+def test_greedy_takes_the_best_of_the_set() -> None:
+    """The set is the pool, in any order, so the most likely choice is known in every state; the
+    observation is normalised with the given statistics."""
+    for seed in range(6):
+        ids = np.random.default_rng(seed).permutation(A)[:4]
+
+        def choose(rung: int, ids: np.ndarray = ids) -> int:
+            raw = np.asarray(LADDER.observations, np.float64)[rung]
+            deviation = np.sqrt(np.asarray(STATISTICS.variance) + 1e-8)
+            obs = np.clip((raw - np.asarray(STATISTICS.mean)) / deviation, -10, 10)
+            return int(ids[numpy_policy.utilities(params(), obs, TABLE[ids]).argmax()])
+
+        got = run(4, ids, 3, deterministic=True)
+        assert_episodes(got, known_episode(choose), 3)
+
+
+@pytest.mark.oracle
+def test_sampling_follows_the_policy() -> None:
+    """First step of an episode, from the rung it leads to: `1 + id % 4`."""
+    ids = np.array([0, 1, 2, 3])
+    one_step = LADDER.replace(time_limit=jnp.int32(1))
+    evaluator = Evaluator(probe.TableWorld(A), one_step, METHOD, set_size=4, width=1000)
+    rungs = evaluator.run(params(), STATISTICS, TABLE, pool_of(ids), KEY, 4000)["final_state"]
+    deviation = np.sqrt(np.asarray(STATISTICS.variance) + 1e-8)
+    obs = (np.asarray(LADDER.observations)[0] - np.asarray(STATISTICS.mean)) / deviation
+    expected = 4000 * special.softmax(numpy_policy.utilities(params(), obs, TABLE[ids]))
+    assert expected.min() > 10
+    counts = np.bincount(rungs.astype(int), minlength=5)[1:]
+    # Fixed key; right frequencies fail for one key in a million.
+    assert ((counts - expected) ** 2 / expected).sum() < stats.chi2.isf(1e-6, 3)
+    # Greedy is something else.
+    greedy = evaluator.run(params(), STATISTICS, TABLE, pool_of(ids), KEY, 5, deterministic=True)
+    assert (greedy["final_state"] == 1 + expected.argmax()).all()
+    assert len(np.unique(rungs)) == 4
+
+
+@pytest.mark.property
+def test_an_episode_does_not_depend_on_the_others() -> None:
+    ids = np.arange(20)
+    many = run(4, ids, 11)
+    assert all(len(values) == 11 for values in many.values())
+    # Ten episodes and more are not all alike, and blocks of four do not repeat.
+    returns = many["episode_return"]
+    assert len(np.unique(returns)) >= 9
+    for count in (1, 4, 6):
+        few = run(4, ids, count)
+        for name, values in few.items():
+            np.testing.assert_array_equal(values, many[name][:count])
+    # Another width is another program, but the same sets, starts and choices.
+    wide = run(4, ids, 11, width=16)
+    for name, values in wide.items():
+        np.testing.assert_allclose(values, many[name], rtol=1e-5)
+
+
+@pytest.mark.property
+def test_numbers_depend_on_the_key_alone() -> None:
+    ids = np.arange(20)
+    first, again = run(4, ids, 8), run(4, ids, 8)
+    other = run(4, ids, 8, key=jax.random.key(8))
+    for name, values in first.items():
+        np.testing.assert_array_equal(values, again[name])
+    assert (first["episode_return"] != other["episode_return"]).any()
+
+
+@pytest.mark.property
+def test_pools_of_every_size_run_the_same_program() -> None:
+    run(4, np.arange(20), 1)
+    before = num_traces
+    returns = [
+        run(4, ids, 4)["episode_return"].mean()
+        for ids in (np.arange(12), np.arange(12, 18), np.arange(18, 24), np.arange(20, 24))
+    ]
+    assert num_traces == before > 0
+    assert len(set(returns)) == 4
+
+
+@pytest.mark.unit
+def test_requests_that_cannot_be_met_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"Sets of 4 .* 3 .*1\.\.3"):
+        run(4, [0, 1, 2], 1)
+    with pytest.raises(ValueError, match=r"num_episodes=0 must be at least 1"):
+        run(4, np.arange(20), 0)
+
+
+@pytest.mark.oracle
+def test_random_play_in_grid_world() -> None:
+    """Spec grid_world 6, [sim]: uniform random skills, 40,000 episodes: success 0.0027 (+- 0.0003),
+    sub-goal 0.126, return 0.0136, 22.7 moves.
+
+    A policy with zero score weights is exactly uniform. Tolerances are four standard errors of the
+    difference between 20,000 episodes and the anchor's 40,000, sigma * sqrt(1/20,000 + 1/40,000)
+    with sigma = sqrt(0.0027), sqrt(0.126 * 0.874), 0.05 and 15, and the anchor's last digit.
+    """
+    env = GridWorld()
+    evaluator = Evaluator(env, env.default_params, METHOD, set_size=50, width=2000)
+    fresh = METHOD.init(jax.random.key(0), jnp.zeros(81), D)
+    fresh["utility"]["score"] = jax.tree.map(jnp.zeros_like, fresh["utility"]["score"])
+    split = random_halves_split(skill_universe(), seed=0)
+    episodes = evaluator.run(
+        fresh,
+        RunningStatistics.zeros((81,)),
+        jax.random.normal(jax.random.key(1), (1024, D)),
+        ActionPool.of(split.ids("all"), capacity=1024),
+        jax.random.key(2),
+        20_000,
+    )
+    assert all(len(values) == 20_000 for values in episodes.values())
+    anchors = {
+        "is_success": (0.0027, 0.0018),
+        "has_reached_subgoal": (0.126, 0.012),
+        "episode_return": (0.0136, 0.0018),
+        "episode_length": (22.7, 0.57),
+    }
+    for name, (anchor, tolerance) in anchors.items():
+        assert abs(episodes[name].mean(dtype=np.float64) - anchor) < tolerance, name
+    # An agent step is up to five moves, and an episode ends within ten.
+    assert (episodes["num_steps"] == np.ceil(episodes["episode_length"] / 5)).all()
+    assert episodes["num_steps"].max() == 10
+
+
+@pytest.mark.oracle
+def test_intervals_are_wilson_for_proportions_and_normal_for_the_rest() -> None:
+    rng = np.random.default_rng(4)
+    episodes = {
+        "is_success": (np.arange(50) < 3).astype(np.float32),
+        "has_reached_subgoal": np.zeros(50, np.float32),
+        "episode_return": rng.normal(2.0, 3.0, 50).astype(np.float32),
+        "num_steps": np.ones(50, np.float32),  # Zeros and ones, yet no proportion.
+    }
+    summary = summarize(episodes)
+    assert set(summary) == set(episodes)
+    for name, successes in (("is_success", 3), ("has_reached_subgoal", 0)):
+        wilson = stats.binomtest(successes, 50).proportion_ci(0.95, method="wilson")
+        got = summary[name]
+        assert got["interval"] == "Wilson 95 %"
+        np.testing.assert_allclose(
+            [got["mean"], got["low"], got["high"]],
+            [successes / 50, wilson.low, wilson.high],
+            atol=1e-6,
+        )
+    returns = episodes["episode_return"].astype(np.float64)
+    half = stats.norm.ppf(0.975) * returns.std(ddof=1) / np.sqrt(50)
+    got = summary["episode_return"]
+    assert got["interval"] == "normal 95 %"
+    np.testing.assert_allclose(
+        [got["mean"], got["low"], got["high"]],
+        [returns.mean(), returns.mean() - half, returns.mean() + half],
+        rtol=1e-6,
+    )
+    assert summary["num_steps"] == {"mean": 1.0, "low": 1.0, "high": 1.0, "interval": "normal 95 %"}
