@@ -28,7 +28,8 @@ from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 
 _SPLITS = ("train", "validation", "test")
-_REPRESENTATION = "hvae"
+# Relative coordinates: raw ones take hours of training to tell skills apart (README, Gotchas).
+_REPRESENTATION = "hvae-relative"
 
 
 def main() -> None:

@@ -84,6 +84,23 @@ def featurize_xy(stored: jax.Array) -> jax.Array:
     return jnp.asarray(stored).astype(jnp.float32)
 
 
+def featurize_relative(stored: jax.Array) -> jax.Array:
+    """Coordinates relative to the start: what a skill does, without where it was done.
+
+    Not in the paper. From raw coordinates an HVAE learns for tens of thousands of steps to predict
+    where on the 80 x 80 grid the next cell is, before it learns what tells skills apart; from these
+    it learns that within minutes.
+
+    Args:
+      stored: uint8[..., 6, 2] from `record`.
+
+    Returns:
+      f32[..., 6, 2] in -5..5; the first step is (0, 0).
+    """
+    coordinates = featurize_xy(stored)
+    return coordinates - coordinates[..., :1, :]
+
+
 def featurize_onehot(stored: jax.Array) -> jax.Array:
     """One-hot coordinates (spec grid_world 5, `one-hot`): 80 numbers for x, then 80 for y.
 

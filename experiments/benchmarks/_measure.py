@@ -258,8 +258,8 @@ def run_benchmark(main: Callable[[], None]) -> None:
         if len(arguments) > 1:
             raise app.UsageError(f"Unknown argument {arguments[1]!r}; options are --flag=value.")
         logging.set_verbosity(logging.WARNING)
-        if not QUICK.value:
-            jax.config.update("jax_enable_compilation_cache", False)
+        jax.config.update("jax_enable_compilation_cache", False)
+        jax.config.update("jax_disable_most_optimizations", QUICK.value)
         main()
 
     app.run(wrapped)

@@ -1,4 +1,4 @@
-"""Training at the paper's shapes: steps per second, where the time goes, and how far from the floor.
+"""Training at the paper's shapes: steps per second, where the time goes, how far from the floor.
 
     python -m experiments.benchmarks.training
 

@@ -5,7 +5,7 @@ python -m experiments.benchmarks.utility
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -13,15 +13,17 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
+from experiments._training import Trainer
 from experiments.benchmarks import _grid_world
 from experiments.benchmarks import _measure as m
-from jaxnew.policy import Categorical, PolicyMethod, UtilityMethod
+from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
 from jaxnew.policy.utility import Utility
 from jaxnew.ppo import Learner
 
 SET_SIZES = (20, 50, 500)
-MICROBATCH_SIZES = (0, 64, 128, 256, 512)
+SIZES = (0, 64, 128, 256, 512)  # Of microbatches.
+RATIO = "time of the first over time of the second"
 FORMS = ("factored", "concatenated")
 
 
@@ -95,31 +97,34 @@ def layer_subjects(num_states: int, set_size: int, num_actions: int) -> dict[str
     return subjects
 
 
-def gradient_subject(learner: Learner, set_size: int, num_transitions: int) -> m.Subject:
-    """The learner's gradient of one minibatch."""
-    trainer = _grid_world.make_trainer(set_size)
-    params = trainer.init().params
+def gradient_subjects(
+    trainer: Trainer,
+    variants: Mapping[str, tuple[UtilityMethod, int]],
+    num_transitions: int,
+) -> dict[str, m.Subject]:
+    """The learner's gradient of one minibatch, for each name -> (method, microbatch size)."""
+    rollout = trainer.learner.rollout
+    rollout_config = replace(rollout.config, num_envs=1, num_steps=num_transitions)
+    params = jax.jit(trainer.learner.init)(
+        jax.random.key(0), trainer.table, trainer.pools["train"]
+    ).params
+    minibatch = jax.jit(lambda key: _grid_world.random_minibatch(key, trainer, num_transitions))
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
-        minibatch = _grid_world.random_minibatch(key, trainer, num_transitions)
-        return params, minibatch, trainer.config.hyperparameters, trainer.table
+        return params, minibatch(key), trainer.config.hyperparameters, trainer.table
 
-    return m.compiled(learner._gradient, inputs)
+    def learner(method: UtilityMethod, microbatch_size: int) -> Learner:
+        config = replace(
+            trainer.config.ppo,
+            rollout=rollout_config,
+            num_minibatches=1,
+            microbatch_size=microbatch_size,
+        )
+        return Learner(replace(rollout, method=method, config=rollout_config), config)
 
-
-def learner_with(
-    method: PolicyMethod, set_size: int, num_transitions: int, microbatch_size: int
-) -> Learner:
-    """A learner whose minibatch is `num_transitions` and whose policy is `method`."""
-    learner = _grid_world.make_trainer(set_size).learner
-    rollout_config = replace(learner.rollout.config, num_envs=1, num_steps=num_transitions)
-    config = replace(
-        learner.config,
-        rollout=rollout_config,
-        num_minibatches=1,
-        microbatch_size=microbatch_size,
-    )
-    return Learner(replace(learner.rollout, method=method, config=rollout_config), config)
+    return {
+        name: m.compiled(learner(*variant)._gradient, inputs) for name, variant in variants.items()
+    }
 
 
 def report_layer(report: m.Report) -> None:
@@ -130,58 +135,38 @@ def report_layer(report: m.Report) -> None:
         report.timing(f"layer {name}", timing, work={"states": num_states}, how=how)
     for direction in ("forward", "forward and backward"):
         slow, fast = (timings[f"{form}, {direction}"] for form in reversed(FORMS))
-        how = "time of the first over time of the second"
-        report.values(f"concatenated / factored, {direction}", m.ratio(slow, fast), how=how)
+        report.values(f"concatenated / factored, {direction}", m.ratio(slow, fast), how=RATIO)
 
 
 def report_microbatches(report: m.Report) -> None:
-    num_transitions, set_size = (32, 5) if m.QUICK.value else (4096, 50)
-    sizes = (0, 8) if m.QUICK.value else MICROBATCH_SIZES
-    default = sizes[-1] if m.QUICK.value else 256
-    timings = m.measure(
-        {
-            f"{size}": gradient_subject(
-                learner_with(UtilityMethod(), set_size, num_transitions, size),
-                set_size,
-                num_transitions,
-            )
-            for size in sizes
-        },
-        m.REPEATS.value,
-    )
+    num_transitions, sizes, default = (32, (0, 8), 8) if m.QUICK.value else (4096, SIZES, 256)
+    trainer = _grid_world.make_trainer()
+    variants = {str(size): (UtilityMethod(), size) for size in sizes}
+    timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
+    shapes = f"minibatch of {num_transitions}, 0: undivided; {_grid_world.describe(trainer)}"
     for name, timing in timings.items():
-        how = f"gradient of a minibatch of {num_transitions}, m = {set_size}; 0: undivided"
         work = {"transitions": num_transitions}
-        report.timing(f"gradient, microbatches of {name}", timing, work=work, how=how)
+        report.timing(f"gradient, microbatches of {name}", timing, work=work, how=shapes)
     for name, timing in timings.items():
         values = m.ratio(timing, timings[str(default)])
-        how = "time of the first over time of the second"
-        report.values(f"microbatches of {name} / of {default}", values, how=how)
+        report.values(f"microbatches of {name} / of {default}", values, how=RATIO)
 
 
 def report_projection(report: m.Report) -> None:
-    for set_size in (3, 5) if m.QUICK.value else SET_SIZES:
-        num_transitions, microbatch = (16, 8) if m.QUICK.value else (2048, 128)
-        timings = m.measure(
-            {
-                name: gradient_subject(
-                    learner_with(method(), set_size, num_transitions, microbatch),
-                    set_size,
-                    num_transitions,
-                )
-                for name, method in METHODS.items()
-            },
-            m.REPEATS.value,
-        )
-        shapes = f"minibatch of {num_transitions}, microbatches of {microbatch}, m = {set_size}"
+    """Forms of the layer within the learner's gradient; small minibatches keep m = 500 short."""
+    num_transitions, size = (16, 8) if m.QUICK.value else (2048, 128)
+    variants = {name: (method(), size) for name, method in METHODS.items()}
+    for set_size in (5,) if m.QUICK.value else SET_SIZES:
+        trainer = _grid_world.make_trainer(set_size)
+        timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
+        how = f"minibatch of {num_transitions}, microbatches of {size}, m = {set_size}"
         for name, timing in timings.items():
             work = {"transitions": num_transitions}
-            report.timing(f"gradient, {name}, m = {set_size}", timing, work=work, how=shapes)
-        first = next(iter(METHODS))
-        for name in list(METHODS)[1:]:
-            how = f"time of the first over time of the second; {shapes}"
-            case = f"({name}) / ({first}), m = {set_size}"
-            report.values(case, m.ratio(timings[name], timings[first]), how=how)
+            report.timing(f"gradient, {name}, m = {set_size}", timing, work=work, how=how)
+        first, *others = METHODS
+        for name in others:
+            values = m.ratio(timings[name], timings[first])
+            report.values(f"({name}) / ({first}), m = {set_size}", values, how=RATIO)
 
 
 def main() -> None:

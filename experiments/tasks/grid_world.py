@@ -62,6 +62,7 @@ TASK = Task(
         block_actions=128,
         modalities={
             "xy": Modality("xy", 2, "gaussian", 0, play.featurize_xy),
+            "relative": Modality("relative", 2, "gaussian", 0, play.featurize_relative),
             "onehot": Modality(
                 "onehot", 2 * play.PLAY_SIZE, "categorical", play.PLAY_SIZE, play.featurize_onehot
             ),
@@ -74,7 +75,10 @@ TASK = Task(
             16, replace(_HVAE, num_steps=8, recordings_per_action=4, actions_per_batch=16), 8, "s"
         ),
         "laptop": _stage_one(
-            1024, replace(_HVAE, num_steps=400, recordings_per_action=16), 400, "minutes"
+            256,
+            replace(_HVAE, num_steps=800, recordings_per_action=32, actions_per_batch=32),
+            400,
+            "minutes",
         ),
         "fast": _stage_one(
             1024, replace(_HVAE, num_steps=2000, recordings_per_action=64), 2000, "an hour"
@@ -96,8 +100,8 @@ TASK = Task(
             cost="s",
         ),
         "laptop": StageTwoBudget(
-            num_updates=300,
-            ppo=replace(_PPO, lr_steps=300 * _PPO.steps_per_update),
+            num_updates=500,
+            ppo=replace(_PPO, lr_steps=500 * _PPO.steps_per_update),
             hyperparameters=Hyperparameters(),
             loop=LoopConfig(),
             final_episodes=5000,

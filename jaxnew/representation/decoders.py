@@ -25,10 +25,10 @@ class DecoderStart(nn.Module):
 
     @nn.compact
     def __call__(self, z: jax.Array, c: jax.Array | None) -> jax.Array:
-        """(z f32[B, S, dz], c f32[B, dc] or None) -> g f32[B, S, H]."""
+        """(z f32[dz, B, S], c f32[dc, B] or None) -> g f32[H, B, S]."""
         g = Dense(self.width, self.pytorch_init, name="from_observation")(z)
         if c is not None:
-            g = g + Dense(self.width, self.pytorch_init, name="from_action")(c)[:, None]
+            g = g + Dense(self.width, self.pytorch_init, name="from_action")(c)[:, :, None]
         return nn.relu(g)
 
 
@@ -51,27 +51,28 @@ class TrajectoryDecoder(nn.Module):
         """Decodes.
 
         Args:
-          g: f32[B, S, H] from `DecoderStart`.
+          g: f32[H, B, S] from `DecoderStart`.
           first_step: f32[B, S, D] the recordings' true step 0.
           num_steps: T, at least 2.
         Returns:
           f32[B, S, T-1, D] predicted means (or logits) of steps 1..T-1.
         """
-        dim = first_step.shape[-1]
+        *batch, dim = first_step.shape
         read = Dense(self.width, self.pytorch_init, name="read")
         before = ResBlock(2, self.pytorch_init, name="before_lstm")
         after = ResBlock(2, self.pytorch_init, name="after_lstm")
         write = Dense(dim, self.pytorch_init, name="write")
-        weights = LSTMWeights(self.width, name="lstm")(self.width)
-        kernel_input, kernel_hidden, bias = weights
+        kernel_input, kernel_hidden, bias = LSTMWeights(self.width, name="lstm")(self.width)
+        kernel = jnp.concatenate([kernel_input, kernel_hidden]).T
 
-        step, hidden, cell = first_step, None, None
-        predictions = []
-        for _ in range(num_steps - 1):
-            gates = (g * before(read(step))) @ kernel_input + bias
-            if hidden is not None:
-                gates = gates + hidden @ kernel_hidden
+        g = g.reshape(self.width, -1)
+        step = first_step.reshape(-1, dim).T
+        gates = kernel_input.T @ (g * before(read(step)))
+        hidden, cell = lstm_cell(gates + bias[:, None], None)
+        predictions = [write(after(hidden))]
+        for _ in range(num_steps - 2):
+            u = g * before(read(predictions[-1]))
+            gates = kernel @ jnp.concatenate([u, hidden]) + bias[:, None]
             hidden, cell = lstm_cell(gates, cell)
-            step = write(after(hidden))
-            predictions.append(step)
-        return jnp.stack(predictions, axis=-2)
+            predictions.append(write(after(hidden)))
+        return jnp.stack(predictions).transpose(2, 0, 1).reshape(*batch, num_steps - 1, dim)

@@ -1,11 +1,15 @@
 """Networks that read recordings: dense blocks, scalar batch norm and the trajectory encoder.
 
-A recording encoder maps `[..., T, D]` to `[..., E]`; everything behind it works on that vector
-and does not know what was recorded, so an image encoder only has to give `[..., E]` as well.
+Inside the networks of stage 1 the features lead, `[w, B, S]` or `[w, N]` with `N = B * S`: gates
+and directions are then contiguous blocks, and on a CPU a training step is a fifth cheaper.
+
+A recording encoder maps `[B, S, T, D]` to `[E, B, S]`; everything behind it works on that and does
+not know what was recorded, so an image encoder only has to give `[E, B, S]` as well.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Callable
 
@@ -32,7 +36,7 @@ def uniform_within(bound: float) -> Initializer:
 
 
 class Dense(nn.Module):
-    """Affine map `[..., i] -> [..., o]`: the `Lin(i, o)` of the spec.
+    """Affine map of the leading axis: the `Lin(i, o)` of the spec.
 
     Attributes:
       features: o.
@@ -46,13 +50,15 @@ class Dense(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """f32[..., i] -> f32[..., o]."""
+        """f32[i, ...] -> f32[o, ...]."""
+        num_inputs = x.shape[0]
         kernel_init, bias_init = xavier_normal, nn.initializers.zeros_init()
         if self.pytorch_init:
-            kernel_init = bias_init = uniform_within(1.0 / math.sqrt(x.shape[-1]))
-        kernel = self.param("kernel", kernel_init, (x.shape[-1], self.features))
+            kernel_init = bias_init = uniform_within(1.0 / math.sqrt(num_inputs))
+        kernel = self.param("kernel", kernel_init, (num_inputs, self.features))
         bias = self.param("bias", bias_init, (self.features,))
-        return x @ kernel + bias
+        y = kernel.T @ x.reshape(num_inputs, -1) + bias[:, None]
+        return y.reshape(self.features, *x.shape[1:])
 
 
 class ResBlock(nn.Module):
@@ -70,10 +76,10 @@ class ResBlock(nn.Module):
 
     @nn.compact
     def __call__(self, x: jax.Array) -> jax.Array:
-        """f32[..., w] -> f32[..., w]."""
+        """f32[w, ...] -> f32[w, ...]."""
         e = x
         for layer in range(self.num_layers):
-            e = Dense(x.shape[-1], self.pytorch_init)(nn.relu(e) if layer else e)
+            e = Dense(x.shape[0], self.pytorch_init)(nn.relu(e) if layer else e)
         return nn.relu(e + x)
 
 
@@ -97,20 +103,16 @@ class ScalarBatchNorm(nn.Module):
         return norm(x.reshape(-1, 1)).reshape(x.shape)
 
 
-def lstm_cell(
-    gates: jax.Array, cell: jax.Array | None, axis: int = -1
-) -> tuple[jax.Array, jax.Array]:
+def lstm_cell(gates: jax.Array, cell: jax.Array | None) -> tuple[jax.Array, jax.Array]:
     """One LSTM step from pre-activations; PyTorch's gate order (input, forget, candidate, output).
 
     Args:
-      gates: f32 with 4E entries on `axis`: the sum of the input's, the hidden state's and both bias
-        contributions.
-      cell: cell state, E entries on `axis`; None for zeros.
-      axis: where the features lie.
+      gates: f32[4E, N] sum of the input's, the hidden state's and both bias contributions.
+      cell: f32[E, N] cell state, None for zeros.
     Returns:
-      (hidden, cell), each with E entries on `axis`.
+      (hidden f32[E, N], cell f32[E, N]).
     """
-    write, forget, candidate, output = jnp.split(gates, 4, axis)
+    write, forget, candidate, output = jnp.split(gates, 4)
     new_cell = nn.sigmoid(write) * jnp.tanh(candidate)
     if cell is not None:
         new_cell = new_cell + nn.sigmoid(forget) * cell
@@ -142,7 +144,7 @@ class LSTMWeights(nn.Module):
 
 
 class BiLSTMLayer(nn.Module):
-    """One bidirectional LSTM layer, zero initial states, features on the leading axis.
+    """One bidirectional LSTM layer, zero initial states.
 
     Attributes:
       hidden: E per direction.
@@ -169,17 +171,16 @@ def _run_direction(
 ) -> list[jax.Array]:
     """Hidden states, T arrays f32[E, N], of an LSTM that reads `steps`, T arrays f32[i, N].
 
-    Unrolled, with features leading, so that gates and directions are contiguous blocks, and one
-    product per step. On two CPU cores a gradient is a fifth cheaper than with the input products
-    of all steps hoisted into one large product: that one's output does not fit the caches.
+    Unrolled (T is small), with one product per step. Hoisting the input products of all steps into
+    one is slower on a CPU: its output does not fit the caches.
     """
     kernel_input, kernel_hidden, bias = weights
     kernel = jnp.concatenate([kernel_input, kernel_hidden]).T
-    hidden, cell = lstm_cell(kernel_input.T @ steps[0] + bias[:, None], None, axis=0)
+    hidden, cell = lstm_cell(kernel_input.T @ steps[0] + bias[:, None], None)
     outputs = [hidden]
     for step in steps[1:]:
         gates = kernel @ jnp.concatenate([step, hidden]) + bias[:, None]
-        hidden, cell = lstm_cell(gates, cell, axis=0)
+        hidden, cell = lstm_cell(gates, cell)
         outputs.append(hidden)
     return outputs
 
@@ -197,15 +198,15 @@ class TrajectoryEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, features: jax.Array) -> jax.Array:
-        """f32[..., T, D] -> f32[..., E]."""
+        """f32[B, S, T, D] -> f32[E, B, S]."""
         *batch, num_steps, dim = features.shape
         flat = features.reshape(-1, num_steps, dim)
         steps = [flat[:, t].T for t in range(num_steps)]
         forward, backward = BiLSTMLayer(self.width)(steps)
         steps = [jnp.concatenate(pair) for pair in zip(forward, backward, strict=True)]
         forward, backward = BiLSTMLayer(self.width)(steps)
-        mean = sum(forward + backward) / (2 * num_steps)
-        return mean.T.reshape(*batch, self.width)
+        mean = functools.reduce(jnp.add, forward + backward) / (2 * num_steps)
+        return mean.reshape(self.width, *batch)
 
 
 class LatentHead(nn.Module):
@@ -225,7 +226,7 @@ class LatentHead(nn.Module):
 
     @nn.compact
     def __call__(self, e: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """f32[..., H] -> (mean f32[..., dz], log-variance f32[dz])."""
+        """f32[H, ...] -> (mean f32[dz, ...], log-variance f32[dz])."""
         for _ in range(2):
             e = ResBlock(2, self.pytorch_init)(e)
         mean = ScalarBatchNorm()(Dense(self.latent, self.pytorch_init)(e), training)

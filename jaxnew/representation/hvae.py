@@ -35,12 +35,12 @@ class ActionInference(nn.Module):
 
     @nn.compact
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """f32[B, S, E] -> (mean f32[B, dc], log-variance f32[B, dc]); blind to the order of S."""
+        """f32[E, B, S] -> (mean f32[dc, B], log-variance f32[dc, B]); blind to the order of S."""
         e = ResBlock(2)(nn.relu(Dense(self.width)(h)))
         # Spec 3.3 has Lin, then the mean over S. The two commute, and this order is cheaper.
-        e = Dense(self.width)(jnp.mean(e, axis=1))
+        e = Dense(self.width)(jnp.mean(e, axis=-1))
         e = Dense(2 * self.latent)(ResBlock(3)(e))
-        mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2, axis=-1)
+        mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2)
         return mean, log_variance
 
 
@@ -57,10 +57,10 @@ class ObservationInference(nn.Module):
 
     @nn.compact
     def __call__(self, h: jax.Array, c: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """(f32[B, S, E], f32[B, dc]) -> (mean f32[B, S, dz], log-variance f32[dz])."""
+        """(f32[E, B, S], f32[dc, B]) -> (mean f32[dz, B, S], log-variance f32[dz])."""
         from_recording = Dense(self.width, name="from_recording")(h)
         from_action = Dense(self.width, name="from_action")(c)
-        e = nn.relu(from_recording + from_action[:, None])
+        e = nn.relu(from_recording + from_action[:, :, None])
         return LatentHead(self.latent)(e, training)
 
 
@@ -77,8 +77,8 @@ class LatentPrior(nn.Module):
 
     @nn.compact
     def __call__(self, c: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """f32[B, dc] -> (mean f32[B, 1, dz], log-variance f32[dz])."""
-        e = nn.relu(Dense(self.width)(c))[:, None]
+        """f32[dc, B] -> (mean f32[dz, B, 1], log-variance f32[dz])."""
+        e = nn.relu(Dense(self.width)(c))[:, :, None]
         return LatentHead(self.latent)(e, training)
 
 
@@ -123,17 +123,18 @@ class HVAE(nn.Module):
         """
         h = self.encoder(features)
         action_mean, action_log_variance = self.action_inference(h, training)
-        c = sample_gaussian(action_mean, action_log_variance, noise.action)
-        observation_mean, observation_log_variance = self.observation_inference(h, c, training)
-        z = sample_gaussian(observation_mean, observation_log_variance, noise.observation)
+        c = sample_gaussian(action_mean, action_log_variance, noise.action.T)
+        z_mean, z_log_variance = self.observation_inference(h, c, training)
+        z_noise = jnp.moveaxis(noise.observation, -1, 0)
+        z = sample_gaussian(z_mean, z_log_variance[:, None, None], z_noise)
         prior_mean, prior_log_variance = self.latent_prior(c, training)
         prediction = self.decoder(self.decoder_start(z, c), features[:, :, 0], features.shape[2])
         return VAEOutput(
-            action_mean=action_mean,
-            action_log_variance=action_log_variance,
-            observation_mean=observation_mean,
-            observation_log_variance=observation_log_variance,
-            prior_mean=prior_mean,
+            action_mean=action_mean.T,
+            action_log_variance=action_log_variance.T,
+            observation_mean=jnp.moveaxis(z_mean, 0, -1),
+            observation_log_variance=z_log_variance,
+            prior_mean=jnp.moveaxis(prior_mean, 0, -1),
             prior_log_variance=prior_log_variance,
             prediction=prediction,
             likelihood_log_variance=self.likelihood_log_variance,
@@ -141,4 +142,5 @@ class HVAE(nn.Module):
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`q(c | O)` with running averages: f32[B, S, T, D] -> (mean, log-variance) f32[B, dc]."""
-        return self.action_inference(self.encoder(features), False)
+        mean, log_variance = self.action_inference(self.encoder(features), False)
+        return mean.T, log_variance.T

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import jax
@@ -282,10 +282,11 @@ class RepresentationLearner:
             "reconstruction": terms.reconstruction,
             "kl_action": terms.kl_action,
             "kl_observation": terms.kl_observation,
-            "grad_norm": optax.global_norm(grads),
+            "grad_norm": jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(grads))),
             "nonfinite": jnp.asarray(nonfinite, jnp.float32),
         }
-        state = state.replace(
+        state = replace(
+            state,
             params=optax.apply_updates(state.params, updates),
             batch_stats=batch_stats,
             opt_state=opt_state,
@@ -342,7 +343,8 @@ class RepresentationLearner:
     ) -> tuple[jax.Array, jax.Array]:
         variables = {"params": params, "batch_stats": batch_stats}
         features = self.modality.featurize(recordings)
-        return self._model.apply(variables, features, method="posterior")
+        posterior: Any = self._model.apply(variables, features, method="posterior")
+        return posterior
 
 
 def _build_model(config: RepresentationConfig, modality: Modality) -> HVAE | FlatVAE:

@@ -29,7 +29,7 @@ class FlatInference(nn.Module):
 
     @nn.compact
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """f32[..., E] -> (mean f32[..., dz], log-variance f32[dz])."""
+        """f32[E, B, S] -> (mean f32[dz, B, S], log-variance f32[dz])."""
         e = nn.relu(Dense(self.width, pytorch_init=True)(h))
         return LatentHead(self.latent, pytorch_init=True)(e, training)
 
@@ -67,14 +67,15 @@ class FlatVAE(nn.Module):
           training: True normalises with batch statistics and updates the running averages.
         """
         mean, log_variance = self.inference(self.encoder(features), training)
-        z = sample_gaussian(mean, log_variance, noise.observation)
+        z_noise = jnp.moveaxis(noise.observation, -1, 0)
+        z = sample_gaussian(mean, log_variance[:, None, None], z_noise)
         prediction = self.decoder(self.decoder_start(z, None), features[:, :, 0], features.shape[2])
         return VAEOutput(
             action_mean=None,
             action_log_variance=None,
-            observation_mean=mean,
+            observation_mean=jnp.moveaxis(mean, 0, -1),
             observation_log_variance=log_variance,
-            prior_mean=jnp.zeros_like(mean[:, :1]),
+            prior_mean=jnp.zeros((features.shape[0], 1, self.observation_latent)),
             prior_log_variance=jnp.zeros_like(log_variance),
             prediction=prediction,
             likelihood_log_variance=self.likelihood_log_variance,
@@ -90,5 +91,5 @@ class FlatVAE(nn.Module):
           log-variance, f32[B, dz].
         """
         mean, log_variance = self.inference(self.encoder(features), False)
-        mean = jnp.mean(mean, axis=1)
+        mean = jnp.mean(mean, axis=-1).T
         return mean, jnp.broadcast_to(log_variance, mean.shape)

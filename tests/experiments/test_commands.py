@@ -38,12 +38,12 @@ def hvae_run(runs: Path) -> Path:
     assert [command.split()[0] for command in commands] == ["collect", "embed", "train"]
     for command in commands:
         run(*command.replace("laptop", "smoke").split(), f"--runs={runs}")
-    return runs / "grid_world" / "ours-hvae-default-smoke-31"
+    return runs / "grid_world" / "ours-hvae-relative-default-smoke-31"
 
 
 @pytest.fixture(scope="module")
 def encoder_run(hvae_run: Path) -> Path:
-    return hvae_run.parent / "embed-hvae-default-smoke-31"
+    return hvae_run.parent / "embed-hvae-relative-default-smoke-31"
 
 
 def read_json(path: Path) -> dict:
@@ -132,7 +132,7 @@ def test_new_actions_are_recorded_encoded_and_acted_with(
 
 def test_train_again_finds_the_run_complete(hvae_run: Path, runs: Path) -> None:
     before = (hvae_run / "metrics.jsonl").read_bytes()
-    output = run("train", "--budget=smoke", "--representation=hvae", f"--runs={runs}")
+    output = run("train", "--budget=smoke", "--representation=hvae-relative", f"--runs={runs}")
     assert "already complete" in output
     assert (hvae_run / "metrics.jsonl").read_bytes() == before
 
@@ -142,7 +142,7 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
     output = run(
         "train",
         "--budget=smoke",
-        "--representation=hvae",
+        "--representation=hvae-relative",
         f"--runs={runs}",
         "--set=hyperparameters.clip=0.2",
         fails=True,
@@ -155,14 +155,14 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
 
 
 def test_an_embed_report(encoder_run: Path, runs: Path) -> None:
-    run("embed", "--budget=smoke", "--representation=hvae", f"--runs={runs}")
+    run("embed", "--budget=smoke", "--representation=hvae-relative", f"--runs={runs}")
     numbers = read_json(encoder_run / "evaluation" / "representation.json")
     assert 0.0 <= numbers["purity_held_out"] <= 1.0
     assert len(numbers["linear_r2"]["net displacement"]) == 2
     assert len(numbers["linear_r2"]["per-move coordinates"]) == 10
 
 
-@pytest.mark.parametrize("representation", ["hvae-onehot", "vae"])
+@pytest.mark.parametrize("representation", ["hvae", "hvae-onehot", "vae"])
 def test_other_representations_train(runs: Path, representation: str) -> None:
     run("embed", "--budget=smoke", f"--representation={representation}", f"--runs={runs}")
     path = runs / "grid_world" / f"embed-{representation}-default-smoke-31"

@@ -148,7 +148,7 @@ def test_grid_world_split_is_random_and_reproducible() -> None:
 
 
 @pytest.mark.property
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=60, deadline=None, derandomize=True)
 @given(
     content=st.lists(st.integers(0, 30), min_size=8, max_size=80).filter(
         lambda values: len(set(values)) >= 4
@@ -312,7 +312,7 @@ def test_an_edited_file_is_refused(tmp_path: Path, field: str, value: object) ->
 
 
 @pytest.mark.property
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40, deadline=None, derandomize=True)
 @given(
     ids=st.lists(st.integers(0, 500), min_size=5, max_size=60, unique=True),
     seed=st.none() | st.integers(0, 2**63),

@@ -67,8 +67,9 @@ def run(set_size: int, ids: list[int] | np.ndarray, num_episodes: int, **options
 
 def known_episode(choose: Any) -> dict[str, float]:
     """The ladder climbed in NumPy; `choose` maps (rung) to an id."""
-    rung, total, next_state = 0, 0.0, np.asarray(LADDER.next_state)
-    for step in range(1, int(LADDER.time_limit) + 1):
+    rung, total, step, next_state = 0, 0.0, 0, np.asarray(LADDER.next_state)
+    while step < int(LADDER.time_limit):
+        step += 1
         action_id = choose(rung)
         reward = float(LADDER.reward[rung, action_id])
         total += reward
@@ -92,8 +93,7 @@ def assert_episodes(got: dict[str, np.ndarray], expected: dict[str, float], coun
 
 
 @pytest.mark.oracle
-@pytest.mark.parametrize("deterministic", [False, True])
-def test_metrics_are_those_at_the_end_of_the_episode(deterministic: bool) -> None:
+def test_metrics_are_those_at_the_end_of_the_episode() -> None:
     """With one action to choose from, an episode is known. Action 3 climbs 4 rungs a step and is at
     the top after 3, where the evaluation goes on stepping until others have ended; action 0 climbs
     one and is stopped by the time limit of 4."""
@@ -101,8 +101,7 @@ def test_metrics_are_those_at_the_end_of_the_episode(deterministic: bool) -> Non
     for action_id in range(8):
         expected = known_episode(lambda _, action_id=action_id: action_id)
         lengths.add(expected["num_steps"])
-        got = run(1, [action_id], 3, deterministic=deterministic)
-        assert_episodes(got, expected, 3)
+        assert_episodes(run(1, [action_id], 3), expected, 3)
     assert lengths == {3.0, 4.0}
 
 
@@ -129,18 +128,16 @@ def test_sampling_follows_the_policy() -> None:
     ids = np.array([0, 1, 2, 3])
     one_step = LADDER.replace(time_limit=jnp.int32(1))
     evaluator = Evaluator(probe.TableWorld(A), one_step, METHOD, set_size=4, width=1000)
-    rungs = evaluator.run(params(), STATISTICS, TABLE, pool_of(ids), KEY, 4000)["final_state"]
+    soft = jax.tree.map(lambda x: x / 2, params())
+    rungs = evaluator.run(soft, STATISTICS, TABLE, pool_of(ids), KEY, 4000)["final_state"]
     deviation = np.sqrt(np.asarray(STATISTICS.variance) + 1e-8)
     obs = (np.asarray(LADDER.observations)[0] - np.asarray(STATISTICS.mean)) / deviation
-    expected = 4000 * special.softmax(numpy_policy.utilities(params(), obs, TABLE[ids]))
-    assert expected.min() > 10
+    expected = 4000 * special.softmax(numpy_policy.utilities(soft, obs, TABLE[ids]))
+    assert expected.min() > 20
+    assert np.ptp(expected) > 200
     counts = np.bincount(rungs.astype(int), minlength=5)[1:]
     # Fixed key; right frequencies fail for one key in a million.
     assert ((counts - expected) ** 2 / expected).sum() < stats.chi2.isf(1e-6, 3)
-    # Greedy is something else.
-    greedy = evaluator.run(params(), STATISTICS, TABLE, pool_of(ids), KEY, 5, deterministic=True)
-    assert (greedy["final_state"] == 1 + expected.argmax()).all()
-    assert len(np.unique(rungs)) == 4
 
 
 @pytest.mark.property

@@ -39,13 +39,16 @@ def sample_many(logits: np.ndarray, mask: np.ndarray | None, count: int, seed: i
 
 
 LOGITS = npst.arrays(
-    np.float32, (5, 7), elements=st.floats(-30, 30, width=32) | st.sampled_from([-1e4, 0.0, 1e4])
+    np.float32,
+    (5, 7),
+    elements=st.floats(-30, 30, width=32, allow_subnormal=False)
+    | st.sampled_from([-1e4, 0.0, 1e4]),
 )
 MASKS = npst.arrays(bool, (5, 7)).map(lambda mask: mask | (np.arange(7) == 3))
 
 
 @pytest.mark.oracle
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(logits=LOGITS)
 def test_unmasked_against_scipy(logits: np.ndarray) -> None:
     log_probs, entropy, mode = map(np.asarray, evaluate(Categorical(jnp.asarray(logits))))
@@ -58,7 +61,7 @@ def test_unmasked_against_scipy(logits: np.ndarray) -> None:
 
 
 @pytest.mark.oracle
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=80, deadline=None, derandomize=True)
 @given(logits=LOGITS, mask=MASKS)
 def test_masked_is_the_distribution_over_the_real_entries(
     logits: np.ndarray, mask: np.ndarray
@@ -208,6 +211,17 @@ def test_extreme_uniform_numbers_never_select_a_masked_entry(
         distribution = Categorical.masked(logits, jnp.asarray(mask))
         drawn = sample_with_uniform(monkeypatch, distribution, uniform)
         assert mask[drawn].all()
+
+
+@pytest.mark.golden
+def test_a_real_key_that_selected_a_masked_entry() -> None:
+    """The uniform number of this key is the largest there is, and the 400 entries end in 40 masked
+    ones. (jax 0.10 on a CPU; the test above does not depend on the bits of a key.)"""
+    logits = jnp.asarray(np.random.default_rng(0).normal(size=(1, 400)) * 2, jnp.float32)
+    distribution = Categorical.masked(logits, jnp.arange(400)[None] < 360)
+    choice = draw(distribution, jax.random.key(20192286))
+    assert int(choice[0]) < 360
+    assert float(distribution.log_prob(choice)[0]) > -100
 
 
 @pytest.mark.unit

@@ -201,8 +201,13 @@ def test_initial_policy_is_almost_uniform(fresh: Any, inputs: Any) -> None:
 
 @pytest.mark.unit
 def test_actor_and_critic_share_nothing(params: Any, inputs: Any) -> None:
-    value_grad = jax.grad(lambda p: jnp.sum(METHOD.value(p, inputs["obs"])))(params)
-    policy_grad = jax.grad(lambda p: log_probs(p, **inputs)[:, 4].sum())(params)
+    @jax.jit
+    def gradients(params: Any) -> tuple[Any, Any]:
+        value_grad = jax.grad(lambda p: jnp.sum(METHOD.value(p, inputs["obs"])))(params)
+        policy_grad = jax.grad(lambda p: log_probs(p, **inputs)[:, 4].sum())(params)
+        return value_grad, policy_grad
+
+    value_grad, policy_grad = gradients(params)
 
     def is_zero(tree: Any) -> bool:
         return all((np.asarray(x) == 0).all() for x in jax.tree.leaves(tree))

@@ -29,7 +29,7 @@ def random_variables(module, *args):
         if names[0] == "batch_stats":
             return np.full(shape.shape, float(names[-1] == "var"), np.float32)
         mean = float(names[-1] == "scale")
-        std = 1 / np.sqrt(shape.shape[0]) if len(shape.shape) == 2 else 0.3
+        std = 1.5 / np.sqrt(shape.shape[0]) if len(shape.shape) == 2 else 0.3
         return rng.normal(mean, std, shape.shape).astype(np.float32)
 
     return jax.tree_util.tree_map_with_path(fill, shapes)
@@ -51,21 +51,21 @@ def test_trajectory_encoder_equals_a_numpy_loop():
     module = encoders.TrajectoryEncoder(6)
     variables = random_variables(module, x)
     plain = reference.as_float64(variables["params"])
-    ours = apply(module, variables, x)
+    ours = np.moveaxis(apply(module, variables, x), 0, -1)
     expected = [[reference.encode_recording(plain, one) for one in rows] for rows in x]
     np.testing.assert_allclose(ours, expected, rtol=RTOL, atol=ATOL)
 
 
 @pytest.mark.oracle
 def test_each_lstm_bias_counts():
-    x = np.ones((1, 2, 2), np.float32)
+    x = np.ones((1, 1, 2, 2), np.float32)
     module = encoders.TrajectoryEncoder(4)
     variables = random_variables(module, x)
-    before = apply(module, variables, x)[0]
+    before = apply(module, variables, x)[:, 0, 0]
     for name in ("bias_input", "bias_hidden"):
         variables["params"]["BiLSTMLayer_1"]["backward"][name] += 0.5
-        after = apply(module, variables, x)[0]
-        expected = reference.encode_recording(reference.as_float64(variables["params"]), x[0])
+        after = apply(module, variables, x)[:, 0, 0]
+        expected = reference.encode_recording(reference.as_float64(variables["params"]), x[0, 0])
         np.testing.assert_allclose(after, expected, rtol=RTOL)
         assert np.abs(after - before).max() > 0.01
         before = after
@@ -74,26 +74,27 @@ def test_each_lstm_bias_counts():
 @pytest.mark.oracle
 def test_still_images_are_sequences_of_length_one():
     """Spec method 3.2: the LSTM reads encoded images with T = 1."""
-    x = np.random.default_rng(1).normal(size=(3, 1, 4)).astype(np.float32)
+    x = np.random.default_rng(1).normal(size=(1, 3, 1, 4)).astype(np.float32)
     module = encoders.TrajectoryEncoder(5)
     variables = random_variables(module, x)
     plain = reference.as_float64(variables["params"])
-    expected = [reference.encode_recording(plain, one) for one in x]
-    np.testing.assert_allclose(apply(module, variables, x), expected, rtol=RTOL, atol=ATOL)
+    expected = [reference.encode_recording(plain, one) for one in x[0]]
+    ours = apply(module, variables, x)[:, 0].T
+    np.testing.assert_allclose(ours, expected, rtol=RTOL, atol=ATOL)
 
 
 @pytest.mark.oracle
 def test_decoder_feeds_back_its_own_predictions():
     rng = np.random.default_rng(2)
-    g = rng.normal(size=(2, 3, 6)).astype(np.float32)
+    g = rng.normal(size=(16, 2, 3)).astype(np.float32)
     first = rng.normal(size=(2, 3, 4)).astype(np.float32)
-    module = decoders.TrajectoryDecoder(6)
+    module = decoders.TrajectoryDecoder(16)  # Wide enough that not all ReLUs are off.
     variables = random_variables(module, g, first, 5)
     plain = reference.as_float64(variables["params"])
     ours = jax.jit(lambda v: module.apply(v, g, first, 5))(variables)
     assert ours.shape == (2, 3, 4, 4)
     for b, s in np.ndindex(2, 3):
-        expected = reference.decode(plain, g[b, s], first[b, s], 5)
+        expected = reference.decode(plain, g[:, b, s], first[b, s], 5)
         np.testing.assert_allclose(ours[b, s], expected, rtol=RTOL, atol=ATOL)
 
 
@@ -118,23 +119,23 @@ def test_scalar_batch_norm_has_one_mean_and_variance():
 
 @pytest.mark.oracle
 def test_action_inference_averages_after_its_last_layer_as_in_the_spec():
-    h = np.random.default_rng(4).normal(size=(3, 4, 5)).astype(np.float32)
+    h = np.random.default_rng(4).normal(size=(5, 3, 4)).astype(np.float32)
     module = ActionInference(width=6, latent=2)
     variables = random_variables(module, h, False)
     (mean, log_variance), _ = apply_in_training(module, variables, h)
     plain = reference.as_float64(variables["params"])
     statistics = reference.scalar_batch_norm(
-        plain["ScalarBatchNorm_0"], reference.action_statistics(plain, h)
+        plain["ScalarBatchNorm_0"], reference.action_statistics(plain, np.moveaxis(h, 0, -1))
     )
-    np.testing.assert_allclose(mean, statistics[:, :2], rtol=RTOL, atol=ATOL)
-    np.testing.assert_allclose(log_variance, statistics[:, 2:], rtol=RTOL, atol=ATOL)
+    np.testing.assert_allclose(mean.T, statistics[:, :2], rtol=RTOL, atol=ATOL)
+    np.testing.assert_allclose(log_variance.T, statistics[:, 2:], rtol=RTOL, atol=ATOL)
 
 
 def small_hvae(gaussian_dim):
     return HVAE(
         encoder_width=5,
-        inference_width=7,
-        hidden_width=6,
+        inference_width=14,
+        hidden_width=12,
         action_latent=3,
         observation_latent=2,
         gaussian_dim=gaussian_dim,
@@ -175,7 +176,7 @@ def test_the_whole_hvae_equals_the_spec_in_numpy(num_categories):
 @pytest.mark.oracle
 def test_the_whole_flat_vae_equals_the_spec_in_numpy():
     features = np.random.default_rng(7).uniform(0, 9, (1, 6, 3, 2)).astype(np.float32)
-    model = FlatVAE(encoder_width=5, hidden_width=6, observation_latent=2, gaussian_dim=2)
+    model = FlatVAE(encoder_width=5, hidden_width=12, observation_latent=2, gaussian_dim=2)
     draws = noise(8, 1, 6)
     variables = random_variables(model, features, draws, False)
     output, _ = apply_in_training(model, variables, features, draws)

@@ -1,0 +1,292 @@
+"""Who may import whom (DESIGN section 2), read from the source, also inside functions."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments")
+
+# Layers of `jaxnew`, lowest first. A module may import lower layers; within one layer, only along
+# `SIDEWAYS`. Files, metrics, configs and the like know nothing of what is learned.
+LAYERS = (
+    {
+        *("actions", "observations"),
+        *("checkpoint", "config", "metrics", "run_directory"),
+    },
+    {"sampling", "environment"},
+    {"policy", "representation"},
+    {"rollout", "ppo"},
+    {"loop", "evaluation"},
+    {"task"},
+)
+SIDEWAYS = {("ppo", "rollout")}
+
+HEAVY = {
+    "brax": {"envs_mjx.brax_adapter"},
+    "mujoco": {"envs_mjx.shape_stacking"},
+}
+HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "jaxnew.actions"}
+
+
+def module_name(path: Path, root: Path = ROOT) -> str:
+    parts = path.relative_to(root).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def modules(root: Path = ROOT) -> dict[str, Path]:
+    return {
+        module_name(path, root): path
+        for package in PACKAGES
+        for path in sorted((root / package).rglob("*.py"))
+    }
+
+
+MODULES = modules()
+
+
+def resolve(name: str, names: Iterator[str] | list[str], known: dict[str, Path]) -> Iterator[str]:
+    """`from package import module` imports the module, `from module import function` the module."""
+    for part in names:
+        yield f"{name}.{part}" if f"{name}.{part}" in known else name
+
+
+def imports_of(path: Path, known: dict[str, Path] = MODULES, root: Path = ROOT) -> set[str]:
+    """Dotted names of the modules that a file imports, at its top or in any function.
+
+    `if TYPE_CHECKING` counts as well: a type is knowledge of the other side.
+    """
+    own_package = module_name(path, root).split(".")
+    if path.name != "__init__.py":
+        own_package = own_package[:-1]
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            base = node.module or ""
+            if node.level:
+                above = own_package[: len(own_package) - node.level + 1]
+                base = ".".join([*above, base] if base else above)
+            found |= set(resolve(base, [alias.name for alias in node.names], known))
+        elif (
+            isinstance(node, ast.Call)
+            and ast.unparse(node.func) in ("importlib.import_module", "import_module", "__import__")
+            and node.args
+            and isinstance(node.args[0], ast.Constant)
+        ):
+            found.add(node.args[0].value)
+    return found
+
+
+IMPORTS = {name: imports_of(path) for name, path in MODULES.items()}
+
+
+def is_within(name: str, allowed: set[str]) -> bool:
+    return any(name == a or name.startswith(a + ".") for a in allowed)
+
+
+def is_ours(name: str) -> bool:
+    return is_within(name, set(PACKAGES))
+
+
+def layer_of(module: str) -> int:
+    """Index into `LAYERS`; private modules (`jaxnew._files`) are support."""
+    part = module.split(".")[1]
+    if part.startswith("_"):
+        return 0
+    for layer, parts in enumerate(LAYERS):
+        if part in parts:
+            return layer
+    raise AssertionError(
+        f"{module} has no layer; add `{part}` to LAYERS in {Path(__file__).name} where DESIGN "
+        "section 2 wants it."
+    )
+
+
+def violations(imports: dict[str, set[str]]) -> list[str]:
+    """Every import against the rules, as `importer -> imported: why`."""
+    found = []
+    for module, names in imports.items():
+        package = module.split(".")[0]
+        for name in sorted(names):
+            why = why_not(module, package, name)
+            if why:
+                found.append(f"{module} -> {name}: {why}")
+    return found
+
+
+def why_not(module: str, package: str, name: str) -> str | None:
+    for library, users in HEAVY.items():
+        if is_within(name, {library}) and package != "experiments" and not is_within(module, users):
+            return f"only {sorted(users)} may import {library}, which takes seconds"
+    if package == "jaxnew":
+        if is_within(name, {"envs_mjx", "envs_host", "experiments", "gymnasium", "pymunk"}):
+            return "the method knows no simulator and no experiment"
+        if is_within(name, {"jaxnew"}):
+            return why_not_within_jaxnew(module, name)
+    if package == "envs_mjx" and is_ours(name):
+        allowed = {"envs_mjx", "jaxnew.actions", "jaxnew.observations", "jaxnew.environment"}
+        if not is_within(name, allowed):
+            return f"envs_mjx may import {sorted(allowed)} of ours"
+    if package == "envs_host":
+        is_standard = name.split(".")[0] in {*sys.stdlib_module_names, "__future__"}
+        if not is_standard and not is_within(name, HOST_MAY_IMPORT):
+            return f"host workers may import {sorted(HOST_MAY_IMPORT)}"
+    return None
+
+
+def why_not_within_jaxnew(module: str, name: str) -> str | None:
+    if module == "jaxnew":
+        return "the face of the package loads lazily"
+    if name == "jaxnew":
+        return "import the module and not the package's face"
+    here, there = module.split(".")[1], name.split(".")[1]
+    is_down = layer_of(name) < layer_of(module)
+    is_beside = here == there or (here, there) in SIDEWAYS
+    is_support = layer_of(name) == layer_of(module) == 0
+    if not (is_down or is_beside or is_support):
+        return f"{here} may not import {there}"
+    if here == "actions":
+        return "actions stands alone"
+    return None
+
+
+@pytest.mark.unit
+def test_imports_keep_to_the_design() -> None:
+    assert len(MODULES) > 40
+    assert violations(IMPORTS) == []
+
+
+@pytest.mark.unit
+def test_there_is_no_cycle_between_modules() -> None:
+    needs = {
+        module: {n for n in names if n in MODULES and n != module}
+        for module, names in IMPORTS.items()
+    }
+    done: set[str] = set()
+
+    def visit(module: str, path: tuple[str, ...]) -> None:
+        assert module not in path, " -> ".join([*path[path.index(module) :], module])
+        if module not in done:
+            for other in sorted(needs[module]):
+                visit(other, (*path, module))
+            done.add(module)
+
+    for module in needs:
+        visit(module, ())
+    assert done == set(MODULES)
+
+
+@pytest.mark.unit
+def test_actions_needs_numpy_only() -> None:
+    others = {n.split(".")[0] for n in IMPORTS["jaxnew.actions"]} - set(sys.stdlib_module_names)
+    assert others == {"numpy"}
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("path", "line", "message"),
+    [
+        ("jaxnew/policy/x.py", "import envs_mjx.grid_world", "no simulator"),
+        ("jaxnew/loop.py", "def f():\n    from experiments import train", "no simulator"),
+        ("jaxnew/ppo/x.py", "from gymnasium import Env", "no simulator"),
+        ("jaxnew/sampling.py", "from jaxnew.policy import Categorical", "sampling may not"),
+        ("jaxnew/policy/x.py", "from ..ppo import gae", "policy may not import ppo"),
+        ("jaxnew/policy/x.py", "from jaxnew import representation", "policy may not import repr"),
+        ("jaxnew/rollout/x.py", "import jaxnew.ppo.learner", "rollout may not import ppo"),
+        ("jaxnew/rollout/x.py", "from jaxnew import loop", "rollout may not import loop"),
+        ("jaxnew/metrics.py", "from jaxnew.evaluation import Evaluator", "metrics may not"),
+        ("jaxnew/environment.py", "from jaxnew.sampling import ActionPool", "environment may not"),
+        ("jaxnew/actions.py", "from jaxnew import config", "actions stands alone"),
+        ("jaxnew/__init__.py", "from jaxnew.actions import ActionSplit", "lazily"),
+        ("jaxnew/policy/x.py", "from jaxnew import ActionSplit", "face"),
+        ("jaxnew/ppo/x.py", "import mujoco.mjx", "takes seconds"),
+        ("envs_mjx/grid_world/x.py", "import brax", "takes seconds"),
+        ("envs_mjx/grid_world/x.py", "from jaxnew.sampling import draw_sets", "envs_mjx may"),
+        ("envs_mjx/grid_world/x.py", "import experiments.train", "envs_mjx may"),
+        ("envs_host/x.py", "import jax", "host workers"),
+        ("envs_host/x.py", "def f():\n    import jax.numpy as jnp", "host workers"),
+        ("envs_host/x.py", "from jaxnew import ActionSplit", "host workers"),
+        ("envs_host/x.py", "from jaxnew.environment import Action", "host workers"),
+        ("envs_host/x.py", 'import importlib\nimportlib.import_module("jax")', "host workers"),
+        ("envs_host/create/x.py", "from ...jaxnew.environment import A", "host workers"),
+    ],
+)
+def test_each_rule_is_broken_by_an_example(
+    tmp_path: Path, path: str, line: str, message: str
+) -> None:
+    file = tmp_path / path
+    file.parent.mkdir(parents=True)
+    file.write_text(line)
+    name = module_name(file, tmp_path)
+    found = violations({name: imports_of(file, MODULES, tmp_path)})
+    assert len(found) >= 1
+    assert all(message in violation for violation in found)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("path", "line"),
+    [
+        ("envs_host/x.py", "import os\nimport numpy as np\nimport pymunk\nfrom . import create"),
+        ("envs_host/x.py", "from jaxnew.actions import ActionSplit\nfrom jaxnew import actions"),
+        ("envs_mjx/shape_stacking/engines/x.py", "import mujoco\nfrom jaxnew import observations"),
+        ("jaxnew/ppo/x.py", "from jaxnew.rollout import batch\nfrom .learner import Learner"),
+        ("jaxnew/evaluation.py", "import jaxnew.ppo\nfrom jaxnew import _files, metrics"),
+        ("experiments/x.py", "import brax, envs_host, envs_mjx.grid_world, jaxnew.loop"),
+    ],
+)
+def test_what_the_design_allows_is_allowed(tmp_path: Path, path: str, line: str) -> None:
+    file = tmp_path / path
+    file.parent.mkdir(parents=True)
+    file.write_text(line)
+    name = module_name(file, tmp_path)
+    assert violations({name: imports_of(file, MODULES, tmp_path)}) == []
+
+
+def loaded_after(*statements: str) -> set[str]:
+    """Top-level modules in `sys.modules` of a fresh interpreter after the statements."""
+    report = "import sys; print(*{name.split('.')[0] for name in sys.modules})"
+    done = subprocess.run(
+        [sys.executable, "-c", "\n".join([*statements, report])],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=True,
+    )
+    return set(done.stdout.split())
+
+
+@pytest.mark.unit
+def test_a_host_worker_gets_no_jax_through_jaxnew() -> None:
+    host_modules = [name for name in MODULES if name.startswith("envs_host")]
+    loaded = loaded_after("import jaxnew.actions", *(f"import {name}" for name in host_modules))
+    assert {"jaxnew", "numpy", "envs_host"} <= loaded
+    assert not loaded & {"jax", "jaxlib", "flax", "optax", "orbax", "chex"}
+
+
+@pytest.mark.unit
+def test_importing_the_package_imports_nothing_else() -> None:
+    loaded = loaded_after("import jaxnew", "import envs_mjx", "import envs_host")
+    assert {"jaxnew", "envs_mjx", "envs_host"} <= loaded
+    assert not loaded & {"numpy", "jax", "flax", "scipy", "mujoco", "pymunk"}
+
+
+@pytest.mark.unit
+def test_every_exported_name_exists() -> None:
+    jaxnew = importlib.import_module("jaxnew")
+    assert len(jaxnew.__all__) > 10
+    for name in jaxnew.__all__:
+        assert getattr(jaxnew, name).__name__ == name
+    assert set(dir(jaxnew)) == set(jaxnew.__all__)
+    with pytest.raises(AttributeError, match="nothing"):
+        _ = jaxnew.nothing
