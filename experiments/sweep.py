@@ -95,12 +95,14 @@ class Sweep:
         """Every member before its first update."""
         keys = jnp.stack([jax.random.key(config.seed) for config in self.configs])
         table, pool = self.trainer.table, self.trainer.pools["train"]
-        init = jax.jit(jax.vmap(lambda key: self.trainer.learner.init(key, table, pool)))
-        members = init(jax.device_put(keys, self.sharding))
+        # One after the other: the batched QR of orthogonal initialisers never returns on CPUs
+        # (jaxlib 0.10.2).
+        init = jax.jit(
+            lambda keys: jax.lax.map(lambda key: self.trainer.learner.init(key, table, pool), keys)
+        )
+        members = jax.device_put(init(keys), self.sharding)
         worst = jnp.full(len(self.configs), -jnp.inf)
-        # Two copies of the members, since the best ones stay while the others go on.
-        state = SweepState(members, jax.tree.map(jnp.copy, members), worst)
-        return jax.device_put(state, self.sharding)
+        return SweepState(members, members, jax.device_put(worst, self.sharding))
 
     @cached_property
     def _updates(self) -> Any:

@@ -41,7 +41,7 @@ def sweep_subject(sweep: Sweep, num_updates: int) -> m.Subject:
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
         keys = jax.device_put(jax.random.split(key, len(sweep.configs)), sweep.sharding)
-        return members.replace(key=keys), sweep.hyperparameters
+        return replace(members, key=keys), sweep.hyperparameters
 
     return m.compiled(lambda *args: sweep._updates(*args, n=num_updates), inputs)
 
@@ -54,13 +54,13 @@ def singles_subject(trainer: Trainer, num_members: int, num_updates: int) -> m.S
     def update(state: TrainState) -> Any:
         return trainer.learner.updates(state, numbers, table, pool, num_updates)
 
-    one = m.compiled(update, lambda key: (start.replace(key=key),))
+    one = m.compiled(update, lambda key: (replace(start, key=key),))
 
     def run_all(states: list[TrainState]) -> list[Any]:
         return [jax.block_until_ready(one.call(state)) for state in states]
 
     def inputs(key: jax.Array) -> tuple[list[TrainState]]:
-        return ([start.replace(key=k) for k in jax.random.split(key, num_members)],)
+        return ([replace(start, key=k) for k in jax.random.split(key, num_members)],)
 
     return m.Subject(run_all, inputs, one.compilation)
 
@@ -133,6 +133,9 @@ def run_with_two_devices() -> int:
     flags_of_xla = os.environ.get("XLA_FLAGS", "")
     environment = {
         **os.environ,
+        # XLA's threads. With as few of them as devices, making the first parameters on several
+        # virtual CPU devices was seen to wait for itself for ever (jax 0.10.2).
+        "NPROC": str(max(4, os.cpu_count() or 1)),
         "XLA_FLAGS": f"{flags_of_xla} --xla_force_host_platform_device_count=2".strip(),
         "JAX_PLATFORMS": "cpu",
     }

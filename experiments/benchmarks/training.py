@@ -161,7 +161,7 @@ def subjects_of(trainer: Trainer, state: TrainState) -> dict[str, m.Subject]:
     collect = jax.jit(learner.rollout.collect)
 
     def update_inputs(key: jax.Array) -> tuple[Any, ...]:
-        return state.replace(key=key), numbers, table, pool
+        return replace(state, key=key), numbers, table, pool
 
     def rollout_inputs(key: jax.Array) -> tuple[Any, ...]:
         return key, state.rollout, state.params, table, pool, numbers.discount

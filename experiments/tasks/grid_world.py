@@ -32,7 +32,8 @@ def _targets(universe: ActionUniverse) -> Mapping[str, np.ndarray]:
 def _stage_one(
     num_recordings: int, hvae: RepresentationConfig, vae_steps: int, cost: str
 ) -> StageOneBudget:
-    vae = replace(hvae, kind="vae", num_steps=vae_steps)
+    # The flat VAE draws a multiple of all train actions per step (spec method 4).
+    vae = replace(hvae, kind="vae", num_steps=vae_steps, actions_per_batch=128)
     return StageOneBudget(
         num_recordings=num_recordings,
         configs={"hvae": hvae, "vae": vae},

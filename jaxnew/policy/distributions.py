@@ -31,12 +31,15 @@ class Categorical:
         One uniform number per choice and the inverse of the cumulative probability: the Gumbel
         trick of `jax.random.categorical` draws m numbers and takes 2 m logarithms for each.
         """
-        cumulative = jnp.cumsum(jax.nn.softmax(self.logits), axis=-1)
-        total = cumulative[..., -1:]
-        uniform = jax.random.uniform(key, total.shape)
-        # Below the total, so that rounding never selects an entry of probability zero.
-        threshold = jnp.minimum(uniform * total, jnp.nextafter(total, 0.0))
-        return jnp.argmax(cumulative > threshold, axis=-1).astype(jnp.int32)
+        probabilities = jax.nn.softmax(self.logits)
+        cumulative = jnp.cumsum(probabilities, axis=-1)
+        uniform = jax.random.uniform(key, (*self.logits.shape[:-1], 1))
+        # Sums round, so an entry of probability zero could be reached, or none at all.
+        is_possible = probabilities > 0.0
+        is_reached = (cumulative > uniform * cumulative[..., -1:]) & is_possible
+        last_possible = self.logits.shape[-1] - 1 - jnp.argmax(is_possible[..., ::-1], axis=-1)
+        choice = jnp.where(jnp.any(is_reached, -1), jnp.argmax(is_reached, -1), last_possible)
+        return choice.astype(jnp.int32)
 
     def log_prob(self, choice: jax.Array) -> jax.Array:
         """f32[...] log-probability of int32[...] choices."""

@@ -10,7 +10,7 @@ from typing import Any
 
 _HOMES = {
     "Modality": "jaxnew.representation.modality",
-    "RepresentationConfig": "jaxnew.representation.learner",
+    "RepresentationConfig": "jaxnew.representation.config",
     "RepresentationLearner": "jaxnew.representation.learner",
     "RepresentationState": "jaxnew.representation.learner",
     "RepresentationTable": "jaxnew.representation.table",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,6 +13,7 @@ import optax
 from flax import struct
 
 from jaxnew.representation.batches import flat_vae_batch, hvae_batch
+from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.objective import (
@@ -27,61 +28,7 @@ from jaxnew.representation.vae import FlatVAE
 
 __all__ = ["Modality", "RepresentationConfig", "RepresentationLearner", "RepresentationState"]
 
-KINDS = ("hvae", "vae")
 Metrics = dict[str, jax.Array]
-
-
-@dataclass(frozen=True)
-class RepresentationConfig:
-    """Hyper-parameters of stage 1; the defaults are those of Grid World (spec method 3).
-
-    Attributes:
-      kind: "hvae" or "vae" (the flat baseline, spec method 4).
-      encoder_width: E, hidden width of the recording encoder per direction.
-      inference_width: Ho, hidden width of the action inference network (HVAE only).
-      hidden_width: H, hidden width of all other networks.
-      action_latent: dc, size of the HVAE's action representation.
-      observation_latent: dz, size of a recording's latent; of the representation for the flat VAE.
-      actions_per_batch: B, train actions per gradient step.
-      recordings_per_action: S, recordings of each per gradient step. The flat VAE draws
-        `A_train * floor(B * S / A_train)` recordings instead.
-      num_steps: gradient steps of the whole training. The flat VAE's reference is 10,000.
-      learning_rate: of RAdam, constant.
-      gradient_clip: every gradient entry is clamped to +- this.
-
-    Raises:
-      TypeError: a count is not an integer.
-      ValueError: a field is out of its range.
-    """
-
-    kind: str = "hvae"
-    encoder_width: int = 64
-    inference_width: int = 128
-    hidden_width: int = 64
-    action_latent: int = 16
-    observation_latent: int = 16
-    actions_per_batch: int = 128
-    recordings_per_action: int = 672
-    num_steps: int = 40_000
-    learning_rate: float = 1e-3
-    gradient_clip: float = 0.5
-
-    def __post_init__(self) -> None:
-        if self.kind not in KINDS:
-            raise ValueError(f"kind={self.kind!r} is unknown; choose one of {KINDS}.")
-        for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(field.default, str):
-                continue
-            if isinstance(field.default, int) and not isinstance(value, int):
-                raise TypeError(f"{field.name}={value!r} must be an integer.")
-            if not value > 0:
-                raise ValueError(f"{field.name}={value!r} must be positive.")
-
-    @property
-    def representation_dim(self) -> int:
-        """d, the length of an action representation."""
-        return self.action_latent if self.kind == "hvae" else self.observation_latent
 
 
 @struct.dataclass
@@ -161,7 +108,7 @@ class RepresentationLearner:
           `kl_action`, `kl_observation` and `grad_norm` (before the clamp), and `nonfinite`, the
           number of non-finite entries of losses and gradients over all steps.
         Raises:
-          ValueError: see `init`; or `num_steps` < 1.
+          ValueError: see `init`; or `num_steps` < 1, or the recordings do not suit the modality.
         """
         self._check_trainable(recordings.shape)
         if num_steps < 1:
@@ -191,7 +138,8 @@ class RepresentationLearner:
           (mean, log-variance), each f32[A, d]. For the flat VAE: the mean over recordings of their
           posterior means, and the log-variance that they all share.
         Raises:
-          ValueError: `recordings` is not 4-dimensional or is empty, or `batch` < 1.
+          ValueError: `recordings` is not 4-dimensional or is empty, they do not suit the modality,
+            or `batch` < 1.
         """
         if len(recordings.shape) != 4 or 0 in recordings.shape:
             raise ValueError(
@@ -317,7 +265,23 @@ class RepresentationLearner:
             batch = flat_vae_batch(
                 key_batch, recordings, self._flat_batch_size(recordings.shape[0])
             )
-        return self.modality.featurize(batch), epoch, key_noise
+        return self._features(batch), epoch, key_noise
+
+    def _features(self, recordings: jax.Array) -> jax.Array:
+        """f32[..., T, D] of stored recordings [..., T, D0].
+
+        Raises:
+          ValueError: the modality's `featurize` gives something else.
+        """
+        features = self.modality.featurize(recordings)
+        expected = (*recordings.shape[:-1], self.modality.feature_dim)
+        if features.shape != expected or features.dtype != jnp.float32:
+            raise ValueError(
+                f"Modality {self.modality.name!r} made {features.dtype}{features.shape} of "
+                f"recordings {recordings.dtype}{recordings.shape}; float32{expected} was expected. "
+                "Correct its featurize or feature_dim, or give it the recordings it is made for."
+            )
+        return features
 
     def _loss(
         self,
@@ -342,8 +306,9 @@ class RepresentationLearner:
         self, params: Any, batch_stats: Any, recordings: jax.Array
     ) -> tuple[jax.Array, jax.Array]:
         variables = {"params": params, "batch_stats": batch_stats}
-        features = self.modality.featurize(recordings)
-        posterior: Any = self._model.apply(variables, features, method="posterior")
+        posterior: Any = self._model.apply(
+            variables, self._features(recordings), method="posterior"
+        )
         return posterior
 
 

@@ -195,6 +195,8 @@ def test_split_sorts_its_ids_and_hashes_membership() -> None:
     changes = [
         {"train": [0, 1]},
         {"train": [0, 1, 7]},
+        {"validation": [3]},
+        {"test": [5]},
         {"train": [0, 1], "validation": [2, 3, 4]},
         {"validation": [5, 6], "test": [3, 4]},
         {"always_available": [9]},

@@ -29,7 +29,7 @@ draw = jax.jit(draw_sets, static_argnames=("set_size", "padded_size"))
 REJECTION = [(6, 6, 3), (6, 16, 6), (40, 200, 39), (512, 1024, 50)]
 SORTING = [(6, 6, 4), (5, 7, 5), (40, 44, 30)]
 CASES = REJECTION + SORTING
-NUM_SETS = 20_000  # One draw per case serves all tests of it.
+NUM_SETS = 60_000  # One draw per case serves all tests of it.
 
 
 def pool_of(size: int, capacity: int, always: tuple[int, ...] = ()) -> ActionPool:

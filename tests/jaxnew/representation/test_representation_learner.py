@@ -359,6 +359,8 @@ def test_bad_calls_are_refused(tiny):
         stage1.train_steps(state, recordings[:3], 1)
     with pytest.raises(ValueError, match="non-empty"):
         stage1.encode(state, recordings[0])
+    with pytest.raises(ValueError, match=r"made float32\(4, 12, 3, 5\) of .* was expected"):
+        stage1.encode(state, np.zeros((4, 12, 3, 5), np.uint8))
     with pytest.raises(ValueError, match="batch=0"):
         stage1.encode(state, recordings, batch=0)
 

@@ -1,0 +1,60 @@
+"""Hyper-parameters of stage 1."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+KINDS = ("hvae", "vae")
+
+
+@dataclass(frozen=True)
+class RepresentationConfig:
+    """Hyper-parameters of stage 1; the defaults are those of Grid World (spec method 3).
+
+    Attributes:
+      kind: "hvae" or "vae" (the flat baseline, spec method 4).
+      encoder_width: E, hidden width of the recording encoder per direction.
+      inference_width: Ho, hidden width of the action inference network (HVAE only).
+      hidden_width: H, hidden width of all other networks.
+      action_latent: dc, size of the HVAE's action representation.
+      observation_latent: dz, size of a recording's latent; of the representation for the flat VAE.
+      actions_per_batch: B, train actions per gradient step.
+      recordings_per_action: S, recordings of each per gradient step. The flat VAE draws
+        `A_train * floor(B * S / A_train)` recordings instead.
+      num_steps: gradient steps of the whole training. The flat VAE's reference is 10,000.
+      learning_rate: of RAdam, constant.
+      gradient_clip: every gradient entry is clamped to +- this.
+
+    Raises:
+      TypeError: a count is not an integer.
+      ValueError: a field is out of its range.
+    """
+
+    kind: str = "hvae"
+    encoder_width: int = 64
+    inference_width: int = 128
+    hidden_width: int = 64
+    action_latent: int = 16
+    observation_latent: int = 16
+    actions_per_batch: int = 128
+    recordings_per_action: int = 672
+    num_steps: int = 40_000
+    learning_rate: float = 1e-3
+    gradient_clip: float = 0.5
+
+    def __post_init__(self) -> None:
+        if self.kind not in KINDS:
+            raise ValueError(f"kind={self.kind!r} is unknown; choose one of {KINDS}.")
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(field.default, str):
+                continue
+            if isinstance(field.default, int) and not isinstance(value, int):
+                raise TypeError(f"{field.name}={value!r} must be an integer.")
+            if not value > 0:
+                raise ValueError(f"{field.name}={value!r} must be positive.")
+
+    @property
+    def representation_dim(self) -> int:
+        """d, the length of an action representation."""
+        return self.action_latent if self.kind == "hvae" else self.observation_latent
