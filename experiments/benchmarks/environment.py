@@ -6,9 +6,9 @@
 One scan of T steps over N environments: a random action for each from one draw, a vmapped step, the
 observation carried so that it is really made. The peers are different games with one move per
 decision; ours has five. They need not be installed, and this module needs of this project's own
-dependencies only jax, flax and absl-py, so that it can run in an environment that a peer wants:
+dependencies only jax, flax, chex and absl-py, so that it can run in an environment for the peers:
 
-    python -m venv peers && peers/bin/pip install absl-py flax navix xminigrid gymnax
+    python -m venv peers && peers/bin/pip install absl-py chex flax navix xminigrid gymnax
     PYTHONPATH=. peers/bin/python -m experiments.benchmarks.environment
 """
 

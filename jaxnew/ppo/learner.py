@@ -46,6 +46,11 @@ class PPOConfig:
     time_limits_are_ends: bool = True
 
     def __post_init__(self) -> None:
+        for name, low in (("num_epochs", 1), ("num_minibatches", 1), ("microbatch_size", 0)):
+            if getattr(self, name) < low:
+                raise ValueError(f"{name}={getattr(self, name)} must be at least {low}.")
+        if not self.max_grad_norm > 0:
+            raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive.")
         num_transitions = self.steps_per_update
         if num_transitions % self.num_minibatches:
             raise ValueError(

@@ -24,6 +24,7 @@ def base() -> TrainConfig:
     return TrainConfig.of(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
 
 
+@pytest.mark.slow  # Minutes of compiling for eight devices.
 @pytest.mark.integration
 def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
