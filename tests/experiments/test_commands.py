@@ -182,7 +182,7 @@ def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
     run(
         "train",
         "--budget=smoke",
-        "--representation=hvae",
+        "--representation=gt12",
         f"--runs={tmp_path}",
         environment=environment,
     )
