@@ -82,6 +82,19 @@ class Sweep:
         mesh = jax.sharding.Mesh(np.array(self.devices), ("members",))
         return jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("members"))
 
+    def _for_members(self, function: Any) -> Any:
+        """`function` of one member, for all: mapped within a device, split over the devices.
+
+        No device waits for another, as they would if the compiler split the mapped program.
+        """
+        return jax.shard_map(
+            jax.vmap(function),
+            mesh=self.sharding.mesh,
+            in_specs=self.sharding.spec,
+            out_specs=self.sharding.spec,
+            check_vma=False,  # Initial carries of the scans inside are the same on every device.
+        )
+
     @cached_property
     def hyperparameters(self) -> Hyperparameters:
         """Numbers of all members, f32[M] each."""
@@ -108,9 +121,10 @@ class Sweep:
     def _updates(self) -> Any:
         def run(members: TrainState, hyperparameters: Hyperparameters, n: int) -> Any:
             table, pool = self.trainer.table, self.trainer.pools["train"]
-            return jax.vmap(
+            update = self._for_members(
                 lambda state, numbers: self.trainer.learner.updates(state, numbers, table, pool, n)
-            )(members, hyperparameters)
+            )
+            return update(members, hyperparameters)
 
         return jax.jit(run, static_argnames="n")
 
@@ -141,7 +155,7 @@ class Sweep:
                 }
             return results
 
-        return jax.jit(jax.vmap(of_member))
+        return jax.jit(self._for_members(of_member))
 
     @cached_property
     def _keep_best(self) -> Any:

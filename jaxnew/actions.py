@@ -89,8 +89,9 @@ class ActionUniverse:
         return content_hash(self.name, np.asarray(self.content))
 
     def content_keys(self) -> list[bytes]:
-        """One key per action; equal keys mean equal actions."""
-        rows = np.ascontiguousarray(self.content).reshape(self.num_actions, -1)
+        """One key per action; equal keys mean equal actions (-0.0 and 0.0 are equal)."""
+        without_minus_zero = self.content + np.zeros((), self.content.dtype)
+        rows = np.ascontiguousarray(without_minus_zero).reshape(self.num_actions, -1)
         return [row.tobytes() for row in rows]
 
 
@@ -156,11 +157,12 @@ class ActionSplit:
             )
         keys = universe.content_keys()
         owner: dict[bytes, str] = {}
-        for name in SPLIT_NAMES:
+        for name in (*SPLIT_NAMES, "always_available"):
             ids = getattr(self, name)
-            if ids[0] < 0 or ids[-1] >= universe.num_actions:
+            outside = ids[(ids < 0) | (ids >= universe.num_actions)]
+            if outside.size:
                 raise ValueError(
-                    f"{name} holds ids {ids[0]}..{ids[-1]}; {universe.name} has 0.."
+                    f"{name} holds action {outside[0]}; {universe.name} has 0.."
                     f"{universe.num_actions - 1}."
                 )
             for action_id in ids.tolist():
@@ -251,7 +253,7 @@ def load_ids(path: Path, universe: ActionUniverse) -> np.ndarray:
     """
     words = path.read_text().replace(",", " ").split()
     try:
-        ids = np.array([int(word) for word in words], np.int32)
+        ids = np.array([int(word) for word in words], np.int64)
     except ValueError as err:
         raise ValueError(f"{path} must hold integer action ids only: {err}.") from err
     if ids.size == 0:
@@ -261,6 +263,7 @@ def load_ids(path: Path, universe: ActionUniverse) -> np.ndarray:
         raise ValueError(
             f"{path} names action {outside[0]}; {universe.name} has 0..{universe.num_actions - 1}."
         )
-    if len(np.unique(ids)) != len(ids):
-        raise ValueError(f"{path} names an action twice; list each id once.")
-    return ids
+    values, counts = np.unique(ids, return_counts=True)
+    if (counts > 1).any():
+        raise ValueError(f"{path} names action {values[counts.argmax()]} twice; list each id once.")
+    return ids.astype(np.int32)

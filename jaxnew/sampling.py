@@ -42,8 +42,10 @@ class ActionPool:
         """Builds a pool of `ids`, padded to `capacity` (usually the size of the universe).
 
         Raises:
-          ValueError: no id, an id twice, or more ids than `capacity`.
+          ValueError: no id, an id twice, more ids than `capacity`, or a capacity above 65,536.
         """
+        if capacity > _MAX_POOL:
+            raise ValueError(f"A pool holds at most {_MAX_POOL} actions, not {capacity}.")
         always = np.zeros(0, np.int32) if always_available is None else always_available
         members = np.setdiff1d(np.asarray(ids, np.int32), always)
         if members.size == 0 or len(np.unique(ids)) != len(ids):
@@ -115,6 +117,7 @@ def _by_sorting_noise(key: jax.Array, pool: ActionPool, count: int) -> jax.Array
     return pool.ids[jax.lax.top_k(noise, count)[1]]
 
 
+_MAX_POOL = 2**16  # The range of `_random_below`.
 _REFILL_BLOCK = 8  # Candidates per set drawn at once to replace repeats.
 
 
@@ -162,7 +165,7 @@ def _first_open(chosen: jax.Array) -> jax.Array:
 
 
 def _random_below(key: jax.Array, shape: tuple[int, ...], bound: jax.Array) -> jax.Array:
-    """int32 in `0..bound-1` for a traced bound below 2**16, uniform to within bound / 2**32.
+    """int32 in `0..bound-1` for a traced bound of at most 2**16, uniform to within bound / 2**32.
 
     The high word of `random_bits * bound`: unlike `jax.random.randint`, one draw and no division.
     """

@@ -39,14 +39,16 @@ class RepresentationState:
       params: network parameters, f32 leaves.
       batch_stats: running averages of the batch norms, f32 leaves.
       opt_state: optimiser state.
-      key: typed PRNG key of the run, never advanced; step i draws from `fold_in`s of it with i.
+      key_epochs: typed PRNG key, never advanced; epoch e is shuffled with `fold_in` of it and e.
+      key_steps: typed PRNG key, never advanced; step i draws with `fold_in` of it and i.
       step: int32[] gradient steps taken.
     """
 
     params: Any
     batch_stats: Any
     opt_state: Any
-    key: jax.Array
+    key_epochs: jax.Array
+    key_steps: jax.Array
     step: jax.Array
 
 
@@ -80,13 +82,15 @@ class RepresentationLearner:
         """
         self._check_trainable(recordings_shape)
         key_params, key_run = jax.random.split(key)
+        key_epochs, key_steps = jax.random.split(key_run)
         features = jnp.zeros((1, 1, recordings_shape[2], self.modality.feature_dim))
         variables = jax.jit(self._init_variables)(key_params, features)
         return RepresentationState(
             params=variables["params"],
             batch_stats=variables["batch_stats"],
             opt_state=self._optimizer.init(variables["params"]),
-            key=key_run,
+            key_epochs=key_epochs,
+            key_steps=key_steps,
             step=jnp.zeros((), jnp.int32),
         )
 
@@ -246,14 +250,13 @@ class RepresentationLearner:
         self, state: RepresentationState, recordings: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """This step's (features f32[B, S, T, D], epoch int32[], key of the latents' noise)."""
-        key_epochs, key_steps = jax.random.split(state.key)
-        key_step = jax.random.fold_in(key_steps, state.step)
+        key_step = jax.random.fold_in(state.key_steps, state.step)
         key_batch, key_noise = jax.random.split(key_step)
         config = self.config
         if config.kind == "hvae":
             epoch = state.step // (recordings.shape[0] // config.actions_per_batch)
             batch = hvae_batch(
-                key_epochs,
+                state.key_epochs,
                 key_batch,
                 state.step,
                 recordings,

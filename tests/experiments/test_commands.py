@@ -182,7 +182,8 @@ def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
     run(
         "train",
         "--budget=smoke",
-        "--representation=gt12",
+        "--representation=hvae",
+        "--representation_budget=smoke",
         f"--runs={tmp_path}",
         environment=environment,
     )

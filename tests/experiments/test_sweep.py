@@ -24,7 +24,6 @@ def base() -> TrainConfig:
     return TrainConfig.of(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
 
 
-@pytest.mark.slow  # Minutes of compiling for eight devices.
 @pytest.mark.integration
 def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
@@ -40,11 +39,12 @@ def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["devices"] == found["devices_of_a_leaf"] == 8
-    # Adam moves a weight by at most about 1e-3 per gradient step, 16 of them here; the same sums in
-    # another order differ by float32 rounding, which Adam's division can magnify where a gradient
-    # is almost zero.
-    assert found["moved"] > 1e-3
-    assert found["largest_difference"] < 1e-4
+    # Adam moves a weight by at most about 1e-3 per gradient step, 16 of them here. The same sums in
+    # another order differ by float32 rounding, which Adam's division and a unit at the kink of its
+    # ReLU magnify where a gradient is almost zero: a few weights, by less than one such step.
+    assert found["moved"] > 1e-2
+    assert found["quantile_99"] < 1e-5
+    assert found["largest_difference"] < 1e-3
     assert found["seven_members_on_six_devices_use"] == 1
 
 
