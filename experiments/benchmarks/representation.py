@@ -46,7 +46,7 @@ def report_training(
         state = learner.init(jax.random.key(0), recordings.shape)
 
         def inputs(key: jax.Array) -> tuple[Any, ...]:
-            return replace(state, key=key), recordings
+            return replace(state, key_steps=key), recordings
 
         return m.compiled(lambda state, data: learner.train_steps(state, data, NUM_STEPS), inputs)
 

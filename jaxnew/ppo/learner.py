@@ -226,7 +226,7 @@ class Learner:
             params = optax.apply_updates(
                 params, jax.tree.map(lambda u: -learning_rate * u, updates)
             )
-            metrics["gradient_norm"] = optax.global_norm(grads)
+            metrics["gradient_norm"] = optax.tree.norm(grads)
             return (params, opt_state), metrics
 
         indices = self._minibatch_indices(key)
