@@ -1,4 +1,4 @@
-"""Trains many seeds and hyper-parameters as one vmapped program, sharded over all devices.
+"""Trains many seeds and hyper-parameters as one program, sharded over all devices.
 
     python -m experiments.sweep --representation=gt12 --seeds=31,41,51,61 \
         --vary=entropy_coefficient=0.01,0.05 --vary=learning_rate=3e-4,1e-3
@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -40,6 +41,9 @@ from jaxnew.run_directory import RunDirectory
 
 SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71"], "Seeds of the members.")
 VARY = flags.DEFINE_multi_string("vary", [], "hyperparameter=value,value,... (repeatable).")
+AT_ONCE = flags.DEFINE_integer(
+    "members_at_once", 0, "Members that a device vmaps; 0: all, or 1 on CPUs.", lower_bound=0
+)
 
 
 @struct.dataclass
@@ -64,17 +68,38 @@ class SweepState:
 
 @dataclass(frozen=True)
 class Sweep:
-    """M runs that differ in seed and hyper-parameters only."""
+    """M runs that differ in seed and hyper-parameters only.
+
+    Attributes:
+      trainer: the compiled parts, which all share.
+      configs: of the members.
+      devices: their number divides that of the members.
+      members_at_once: members that a device vmaps; it takes the others after them.
+    """
 
     trainer: Trainer
     configs: tuple[TrainConfig, ...]
     devices: tuple[jax.Device, ...]
+    members_at_once: int
 
     @classmethod
-    def of(cls, trainer: Trainer, configs: list[TrainConfig], devices: list[jax.Device]) -> Sweep:
-        """A sweep on the largest number of `devices` that divides the number of members."""
+    def of(
+        cls,
+        trainer: Trainer,
+        configs: list[TrainConfig],
+        devices: list[jax.Device],
+        members_at_once: int = 0,
+    ) -> Sweep:
+        """A sweep on the largest number of `devices` that divides the number of members.
+
+        `members_at_once=0` means all that a device has, but 1 on CPUs, which are faster so: what
+        one member needs stays in the caches (`experiments/benchmarks/sweep.py`).
+        """
         count = max(n for n in range(1, len(devices) + 1) if len(configs) % n == 0)
-        return cls(trainer, tuple(configs), tuple(devices[:count]))
+        share = len(configs) // count
+        default = 1 if devices[0].platform == "cpu" else share
+        at_once = min(members_at_once or default, share)
+        return cls(trainer, tuple(configs), tuple(devices[:count]), at_once)
 
     @cached_property
     def sharding(self) -> jax.sharding.NamedSharding:
@@ -87,8 +112,15 @@ class Sweep:
 
         No device waits for another, as they would if the compiler split the mapped program.
         """
+
+        def on_a_device(*members: Any) -> Any:
+            if self.members_at_once == len(self.configs) // len(self.devices):
+                return jax.vmap(function)(*members)
+            batch_size = self.members_at_once if self.members_at_once > 1 else None
+            return jax.lax.map(lambda member: function(*member), members, batch_size=batch_size)
+
         return jax.shard_map(
-            jax.vmap(function),
+            on_a_device,
             mesh=self.sharding.mesh,
             in_specs=self.sharding.spec,
             out_specs=self.sharding.spec,
@@ -189,6 +221,8 @@ class Sweep:
 
 
 def main() -> None:
+    # Each core is a device; without effect on accelerators.
+    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
     task = flag.load_task(flag.TASK.value)
     domain = Domain.of(task, flag.SPLIT.value)
     runs = Path(flag.RUNS.value)
@@ -201,7 +235,7 @@ def main() -> None:
     )
     configs = member_configs(base, parse_seeds(SEEDS.value), VARY.value)
     trainer = Trainer.of(configs[0], task, domain.split, table)
-    sweep = Sweep.of(trainer, configs, jax.devices())
+    sweep = Sweep.of(trainer, configs, jax.devices(), AT_ONCE.value)
     path = Path(flag.WORKDIR.value or domain.folder(runs) / f"sweep-{base.method}-{name}")
     plain = {"members": [config_lib.to_dict(config) for config in configs]}
     with RunDirectory.open_or_create(path, plain, flag.OVERWRITE.value) as run:
@@ -260,21 +294,13 @@ def member_configs(base: TrainConfig, seeds: list[int], vary: list[str]) -> list
             raise flag.UsageError(
                 f"--vary={entry}: choose a hyper-parameter of {', '.join(legal)}."
             )
-    # The members share the cache, so each gets a smaller share of it; the function is the same.
-    combinations = list(itertools.product(*axes))
-    num_members = len(combinations) * len(seeds)
-    size = base.ppo.microbatch_size
-    while size > 16 and size * num_members > 2 * base.ppo.microbatch_size and size % 2 == 0:
-        size //= 2
-    ppo = replace(base.ppo, microbatch_size=size)
     return [
         replace(
             base,
             seed=seed,
-            ppo=ppo,
             hyperparameters=replace(base.hyperparameters, **dict(combination)),
         )
-        for combination in combinations
+        for combination in itertools.product(*axes)
         for seed in seeds
     ]
 

@@ -21,7 +21,7 @@ from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
 from jaxnew.policy.utility import Utility
 from jaxnew.ppo import Learner
 
-SET_SIZES = (20, 50, 500)
+SET_SIZES = (20, 50, 250)
 SIZES = (0, 64, 128, 256, 512)  # Of microbatches.
 RATIO = "time of the first over time of the second"
 FORMS = ("factored", "concatenated")
@@ -153,7 +153,7 @@ def report_microbatches(report: m.Report) -> None:
 
 
 def report_projection(report: m.Report) -> None:
-    """Forms of the layer within the learner's gradient; small minibatches keep m = 500 short."""
+    """Forms of the layer within the learner's gradient; small minibatches keep m = 250 short."""
     num_transitions, size = (16, 8) if m.QUICK.value else (2048, 128)
     variants = {name: (method(), size) for name, method in METHODS.items()}
     for set_size in (5,) if m.QUICK.value else SET_SIZES:

@@ -39,12 +39,9 @@ def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
     assert done.returncode == 0, done.stderr
     found = json.loads(done.stdout.splitlines()[-1])
     assert found["devices"] == found["devices_of_a_leaf"] == 8
-    # Adam moves a weight by at most about 1e-3 per gradient step, 16 of them here. The same sums in
-    # another order differ by float32 rounding, which Adam's division and a unit at the kink of its
-    # ReLU magnify where a gradient is almost zero: a few weights, by less than one such step.
-    assert found["moved"] > 1e-2
-    assert found["quantile_99"] < 1e-5
-    assert found["largest_difference"] < 1e-3
+    # Relative to how far the weights moved; another entropy coefficient makes 0.1.
+    assert found["error_in_turn"] < 1e-5
+    assert found["error_two_at_once"] < 2e-3
     assert found["seven_members_on_six_devices_use"] == 1
 
 
@@ -58,8 +55,6 @@ def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
     assert len(members) == len(found) == 2 * 2 * 3
     assert (2, 0.1, 0.3) in found
     assert all(m.hyperparameters.discount == base.hyperparameters.discount for m in members)
-    # Twelve members share the cache: 256 / 8 = 32 transitions at a time for each.
-    assert {m.ppo.microbatch_size for m in members} == {32}
 
 
 @pytest.mark.unit
