@@ -34,12 +34,10 @@ class Categorical:
         probabilities = jax.nn.softmax(self.logits)
         cumulative = jnp.cumsum(probabilities, axis=-1)
         uniform = jax.random.uniform(key, (*self.logits.shape[:-1], 1))
-        # Sums round, so an entry of probability zero could be reached, or none at all.
-        is_possible = probabilities > 0.0
-        is_reached = (cumulative > uniform * cumulative[..., -1:]) & is_possible
-        last_possible = self.logits.shape[-1] - 1 - jnp.argmax(is_possible[..., ::-1], axis=-1)
-        choice = jnp.where(jnp.any(is_reached, -1), jnp.argmax(is_reached, -1), last_possible)
-        return choice.astype(jnp.int32)
+        # Sums round, so an entry of probability zero could be reached first. One is always reached:
+        # the uniform number is at most 1 - 2**-23, and the product with it rounds below the sum.
+        is_reached = (cumulative > uniform * cumulative[..., -1:]) & (probabilities > 0.0)
+        return jnp.argmax(is_reached, axis=-1).astype(jnp.int32)
 
     def log_prob(self, choice: jax.Array) -> jax.Array:
         """f32[...] log-probability of int32[...] choices."""

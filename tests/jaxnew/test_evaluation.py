@@ -254,3 +254,19 @@ def test_intervals_are_wilson_for_proportions_and_normal_for_the_rest() -> None:
         rtol=1e-6,
     )
     assert summary["num_steps"] == {"mean": 1.0, "low": 1.0, "high": 1.0, "interval": "normal 95 %"}
+
+
+class Patient(probe.TableWorld):
+    """Says that episodes may last longer than they do."""
+
+    def max_episode_steps(self, params: Any) -> int:
+        return 3 * super().max_episode_steps(params)
+
+
+@pytest.mark.unit
+def test_nothing_counts_after_a_time_limit() -> None:
+    evaluator = Evaluator(Patient(A), LADDER, METHOD, set_size=1, width=4)
+    climbs_one = 4  # 4 % 4 = 0: one rung a step, so that four steps stay below the top.
+    found = evaluator.run(params(), STATISTICS, TABLE, pool_of([climbs_one]), KEY, 2)
+    np.testing.assert_array_equal(found["num_steps"], [4, 4])
+    np.testing.assert_array_equal(found["final_state"], [4, 4])
