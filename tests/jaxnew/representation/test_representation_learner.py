@@ -147,6 +147,24 @@ def _without_key_types(state):
 
 
 @pytest.mark.unit
+def test_every_step_draws_a_batch_and_noise_of_its_own(tiny, flat):
+    """Also within an epoch: of one action, whose batches differ only in what the step draws."""
+    stage1, recordings, state = flat
+    metrics = [
+        stage1.train_steps(state.replace(step=jnp.int32(step)), recordings, 1)[1]
+        for step in (0, 1, 2)
+    ]
+    assert len({float(of_step["reconstruction"]) for of_step in metrics}) == 3
+    stage1 = learner.RepresentationLearner(dataclasses.replace(TINY, actions_per_batch=1), XY)
+    features, _, noise = zip(
+        *(stage1._draw(tiny[2].replace(step=jnp.int32(step)), tiny[1][:1]) for step in (0, 1, 2)),
+        strict=True,
+    )
+    assert len({np.asarray(x).tobytes() for x in features}) == 3
+    assert len({jax.random.key_data(key).tobytes() for key in noise}) == 3
+
+
+@pytest.mark.unit
 def test_training_changes_every_parameter_and_leaves_the_keys(tiny):
     stage1, recordings, state = tiny
     trained, metrics = stage1.train_steps(state, recordings, 6)
