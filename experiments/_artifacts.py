@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -23,7 +24,7 @@ from jaxnew.representation.learner import (
     RepresentationLearner,
     RepresentationState,
 )
-from jaxnew.representation.table import RepresentationTable, engineered_table
+from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.run_directory import RunDirectory
 from jaxnew.task import Play, StageOneBudget, Task
 
@@ -31,6 +32,7 @@ from jaxnew.task import Play, StageOneBudget, Task
 REPRESENTATION_SEED = 31
 TABLE_FILE = "table.npz"
 SPLIT_FILE = "split.json"
+_ORACLE = "-oracle"
 
 
 @dataclass(frozen=True)
@@ -81,17 +83,20 @@ class EmbedConfig:
 def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
     """Kind and modality of a learned representation's name, such as `hvae` or `vae-onehot`.
 
+    The suffix `-oracle` says that the encoder is trained on all actions, test ones included.
+
     Raises:
       UsageError: the name is not of that form.
     """
-    kind, _, modality_name = name.partition("-")
+    kind, _, modality_name = name.removesuffix(_ORACLE).partition("-")
     modalities = domain.play.modalities
     modality_name = modality_name or next(iter(modalities))
     if kind not in ("hvae", "vae") or modality_name not in modalities:
         legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in modalities]
         raise UsageError(
-            f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}; engineered: "
-            f"{', '.join(domain.universe.engineered)}; or an embed run, or an .npz file."
+            f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}, each also "
+            f"with {_ORACLE}; engineered: {', '.join(domain.universe.engineered)}; random-SIZE; or "
+            "an embed run, or an .npz file."
         )
     return kind, modalities[modality_name]
 
@@ -139,7 +144,7 @@ def train_representation(
             split_hash=domain.split.hash,
             observations_hash=recordings.hash,
             seed=seed,
-            train_on="train",
+            train_on="all" if name.endswith(_ORACLE) else "train",
             model=budget.configs[kind],
         ),
         assignments or [],
@@ -221,6 +226,8 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
     path = Path(representation)
     if representation in domain.universe.engineered:
         table = engineered_table(domain.universe, representation)
+    elif match := re.fullmatch(r"random-(\d+)", representation):
+        table = random_table(domain.universe, int(match[1]), REPRESENTATION_SEED)
     elif path.is_dir() or path.suffix == ".npz":
         table = RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
     else:

@@ -87,7 +87,7 @@ def _programs(trainer: Trainer, state: TrainState, seed: int) -> tuple[Any, Any]
         distribution = method.distribution(state.params, obs, projected, available.mask)
         keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys)
         sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
-        action = method.decode(sample, available)
+        action = method.decode(sample, available, trainer.table)
         obs, env_state, reward, terminated, truncated, info = jax.vmap(
             env.step_env, in_axes=(0, 0, 0, None)
         )(keys_now[:, 1], env_state, action, env_params)

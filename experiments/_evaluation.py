@@ -19,6 +19,7 @@ from jaxnew.sampling import ActionPool
 def evaluate_on(
     trainer: Trainer,
     state: TrainState,
+    name: str,
     ids: np.ndarray,
     split: ActionSplit,
     *,
@@ -26,13 +27,21 @@ def evaluate_on(
     deterministic: bool = False,
     seed: int = EVALUATION_SEED,
 ) -> dict[str, Any]:
-    """Episodes on sets drawn from `ids`: metrics with intervals over episodes."""
+    """Episodes on sets drawn from `ids`: metrics with intervals over episodes.
+
+    Args:
+      name: of the ids; those of a split may be played otherwise, see `Trainer.on_split`.
+    """
     start = time.perf_counter()
-    episodes = trainer.evaluator.run(
+    evaluator = trainer.evaluator
+    pool = ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available)
+    if name in trainer.pools:
+        evaluator, pool = trainer.on_split(name, evaluator)
+    episodes = evaluator.run(
         state.params,
         state.rollout.observation_statistics,
         trainer.table,
-        ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available),
+        pool,
         jax.random.key(seed),
         num_episodes,
         deterministic,
@@ -40,8 +49,8 @@ def evaluate_on(
     return {
         "metrics": summarize(episodes),
         "num_episodes": num_episodes,
-        "num_actions": len(ids),
-        "set_size": trainer.evaluator.set_size,
+        "num_actions": int(pool.size),
+        "set_size": evaluator.set_size,
         "policy": "greedy" if deterministic else "sampled",
         "evaluation_seed": seed,
         "seconds": round(time.perf_counter() - start, 2),

@@ -14,12 +14,16 @@ from absl import app, flags, logging
 from jaxnew.task import Task
 
 TASK = flags.DEFINE_string("task", "grid_world", "Task name, or package.module:TASK.")
-METHOD = flags.DEFINE_string("method", "ours", "Policy method.")
+METHOD = flags.DEFINE_string(
+    "method",
+    "ours",
+    "ours, no-entropy, no-subsampling, continuous, nearest-neighbour, random.",
+)
 REPRESENTATION = flags.DEFINE_string(
     "representation",
     "hvae",
-    "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot), a "
-    "run directory of embed, or an .npz table.",
+    "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot) and "
+    "-oracle (trained on all actions), random-SIZE, a run directory of embed, or an .npz table.",
 )
 SPLIT = flags.DEFINE_string("split", None, "Name of the split; default: the task's first.")
 BUDGET = flags.DEFINE_string("budget", "laptop", "smoke, laptop, paper (stage one also: fast).")

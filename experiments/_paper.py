@@ -29,7 +29,17 @@ _METHODS = {
     ("ours", "gt12"): "ours_engineered",
     ("ours", "vae"): "vae",
     ("ours", "vae-xy"): "vae",
+    ("ours", "product"): "ours",
+    ("ours", "hvae-oracle"): "ours_oracle_hvae",
 }
+# Baselines and ablations of the policy, on the default representation of a domain.
+_BASELINES = {
+    "no-entropy": "ours_no_entropy",
+    "no-subsampling": "ours_no_subsampling",
+    "continuous": "continuous_output",
+    "nearest-neighbour": "nearest_neighbor",
+}
+_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "product")
 
 
 class PaperError(ValueError):
@@ -80,6 +90,8 @@ class PaperCurve(NamedTuple):
 
 def paper_method(method: str, representation: str) -> str | None:
     """What the paper calls our method on our representation; None if it did not run it."""
+    if method in _BASELINES and representation in _DEFAULT_REPRESENTATIONS:
+        return _BASELINES[method]
     return _METHODS.get((method, representation))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -13,12 +13,12 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
+from experiments._methods import adapted, method_of, train_ids_of
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit
 from jaxnew.checkpoint import Checkpointer, Kind
 from jaxnew.evaluation import Evaluator
-from jaxnew.policy import make_method
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.device import DeviceRollout
@@ -56,6 +56,7 @@ class TrainConfig:
         budget: StageTwoBudget,
         seed: int,
     ) -> TrainConfig:
+        budget = adapted(budget, method, domain.task, domain.split)
         return cls(
             task=domain.task.name,
             method=method,
@@ -73,14 +74,23 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Trainer:
-    """The compiled parts of a run."""
+    """The compiled parts of a run.
+
+    Attributes:
+      pools: actions that evaluations draw sets from, by split.
+      training_pool: actions that training draws sets from, or the fixed set.
+      evaluator: with sets as large as in training, for the evaluation after it.
+      watcher: with sets as large as `LoopConfig` says, for the evaluations during training.
+    """
 
     config: TrainConfig
     task: Task
     learner: Learner
     evaluator: Evaluator
+    watcher: Evaluator
     table: jax.Array
     pools: dict[str, ActionPool]
+    training_pool: ActionPool
 
     @classmethod
     def of(
@@ -92,7 +102,7 @@ class Trainer:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
         env = task.make_environment()
-        method = make_method(config.method)
+        method = method_of(config.method, task, split)
         vectors = table.rows(np.arange(env.action_spec.num_actions))
         rollout_config = config.ppo.rollout
         pools = {
@@ -101,8 +111,16 @@ class Trainer:
             )
             for name in ("train", "validation", "test")
         }
+        training_pool = pools["train"]
+        if rollout_config.has_fixed_set:
+            fixed = train_ids_of(config.method, task, split)
+            training_pool = ActionPool.of(
+                fixed, capacity=len(fixed), always_available=split.always_available
+            )
+        watched_size = config.loop.evaluation_set_size or rollout_config.set_size
+        check_set_size(pools["train"], rollout_config.set_size, "the train actions")
         for name in SPLITS_WATCHED:
-            check_set_size(pools[name], rollout_config.set_size, f"the {name} actions")
+            check_set_size(pools[name], watched_size, f"the {name} actions")
         evaluator = Evaluator(
             env,
             env.default_params,
@@ -111,14 +129,24 @@ class Trainer:
             rollout_config.padded_set_size,
             rollout_config.normalize_observations,
         )
+        watcher = replace(evaluator, set_size=watched_size, padded_set_size=0)
         rollout = DeviceRollout(env, env.default_params, method, rollout_config)
         learner = Learner(rollout, config.ppo)
-        return cls(config, task, learner, evaluator, jnp.asarray(vectors), pools)
+        return cls(
+            config,
+            task,
+            learner,
+            evaluator,
+            watcher,
+            jnp.asarray(vectors),
+            pools,
+            training_pool,
+        )
 
     def init(self) -> TrainState:
         """The state before the first update."""
         key = jax.random.key(self.config.seed)
-        return jax.jit(self.learner.init)(key, self.table, self.pools["train"])
+        return jax.jit(self.learner.init)(key, self.table, self.training_pool)
 
     def chunk(self, state: TrainState, num_updates: int) -> tuple[TrainState, dict[str, Any]]:
         """`num_updates` updates in one call, and their metrics reduced."""
@@ -126,7 +154,7 @@ class Trainer:
             state,
             self.config.hyperparameters,
             self.table,
-            self.pools["train"],
+            self.training_pool,
             num_updates=num_updates,
         )
 
@@ -138,16 +166,32 @@ class Trainer:
         """Mean episode metrics on train and validation sets, from fixed keys."""
         results: dict[str, float] = {}
         for name in SPLITS_WATCHED:
-            episodes = self.evaluator.run(
+            evaluator, pool = self.on_split(name, self.watcher)
+            episodes = evaluator.run(
                 state.params,
                 state.rollout.observation_statistics,
                 self.table,
-                self.pools[name],
+                pool,
                 jax.random.key(EVALUATION_SEED),
                 self.config.loop.evaluation_episodes,
             )
             results |= {f"{name}/{metric}": float(v.mean()) for metric, v in episodes.items()}
         return results
+
+    def on_split(self, name: str, evaluator: Evaluator) -> tuple[Evaluator, ActionPool]:
+        """What evaluates a split: where training has a fixed set, train episodes have all of it."""
+        if name == "train" and self.config.ppo.rollout.has_fixed_set:
+            return self._fixed_evaluator, self.training_pool
+        return evaluator, self.pools[name]
+
+    @cached_property
+    def _fixed_evaluator(self) -> Evaluator:
+        pool = self.training_pool
+        return replace(
+            self.evaluator,
+            set_size=int(pool.size) + len(pool.always_available),
+            padded_set_size=0,
+        )
 
     @property
     def selection_metric(self) -> str:
@@ -237,7 +281,7 @@ def load_trainer(path: Path) -> tuple[RunDirectory, Trainer, ActionSplit]:
 def load_state(run: RunDirectory, trainer: Trainer, kind: Kind) -> tuple[TrainState, int]:
     """A checkpointed state and the update it was saved at."""
     example = jax.eval_shape(
-        trainer.learner.init, jax.random.key(0), trainer.table, trainer.pools["train"]
+        trainer.learner.init, jax.random.key(0), trainer.table, trainer.training_pool
     )
     state, _ = Checkpointer(run.checkpoints).restore(kind, example)
     return state, int(state.step)

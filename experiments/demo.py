@@ -60,7 +60,9 @@ def print_success(path: Path, num_episodes: int) -> None:
     for name in _SPLITS:
         cells = []
         for actor, kind in ((state, "best"), (uniform(state), "random-play")):
-            row = evaluate_on(trainer, actor, split.ids(name), split, num_episodes=num_episodes)
+            row = evaluate_on(
+                trainer, actor, name, split.ids(name), split, num_episodes=num_episodes
+            )
             record(run, name, kind, step, row)
             success = row["metrics"]["is_success"]
             mean, low, high = (100 * success[part] for part in ("mean", "low", "high"))

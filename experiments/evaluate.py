@@ -55,6 +55,7 @@ def main() -> None:
         rows[name] = evaluate_on(
             trainer,
             state,
+            name,
             ids,
             split,
             num_episodes=EPISODES.value,

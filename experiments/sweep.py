@@ -34,10 +34,12 @@ from experiments._training import (
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.checkpoint import Checkpointer
+from jaxnew.evaluation import Evaluator
 from jaxnew.metrics import MetricsLog, read
 from jaxnew.ppo import Hyperparameters, TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run_directory import RunDirectory
+from jaxnew.sampling import ActionPool
 
 SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71"], "Seeds of the members.")
 VARY = flags.DEFINE_multi_string("vary", [], "hyperparameter=value,value,... (repeatable).")
@@ -139,7 +141,7 @@ class Sweep:
     def init(self) -> SweepState:
         """Every member before its first update."""
         keys = jnp.stack([jax.random.key(config.seed) for config in self.configs])
-        table, pool = self.trainer.table, self.trainer.pools["train"]
+        table, pool = self.trainer.table, self.trainer.training_pool
         # One after the other: the batched QR of orthogonal initialisers never returns on CPUs
         # (jaxlib 0.10.2).
         init = jax.jit(
@@ -152,7 +154,7 @@ class Sweep:
     @cached_property
     def _updates(self) -> Any:
         def run(members: TrainState, hyperparameters: Hyperparameters, n: int) -> Any:
-            table, pool = self.trainer.table, self.trainer.pools["train"]
+            table, pool = self.trainer.table, self.trainer.training_pool
             update = self._for_members(
                 lambda state, numbers: self.trainer.learner.updates(state, numbers, table, pool, n)
             )
@@ -163,19 +165,22 @@ class Sweep:
     @cached_property
     def _evaluation(self) -> Any:
         """Mean episode metrics per member, {split/metric: f32[M]}."""
-        evaluator, episodes = self.trainer.evaluator, self.trainer.config.loop.evaluation_episodes
+        episodes = self.trainer.config.loop.evaluation_episodes
         key = jax.random.key(EVALUATION_SEED)
 
         def of_member(state: TrainState) -> dict[str, jax.Array]:
             results: dict[str, jax.Array] = {}
             for name in SPLITS_WATCHED:
+                evaluator, pool = self.trainer.on_split(name, self.trainer.watcher)
 
-                def block(start: jax.Array, name: str = name) -> dict[str, jax.Array]:
+                def block(
+                    start: jax.Array, evaluator: Evaluator = evaluator, pool: ActionPool = pool
+                ) -> dict[str, jax.Array]:
                     return evaluator.play_block(
                         state.params,
                         state.rollout.observation_statistics,
                         self.trainer.table,
-                        self.trainer.pools[name],
+                        pool,
                         key,
                         start,
                     )

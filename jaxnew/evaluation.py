@@ -113,7 +113,7 @@ class Evaluator:
                 sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
             obs, state, _, terminated, truncated, info = jax.vmap(
                 self.env.step_env, in_axes=(0, 0, 0, None)
-            )(keys_now[:, 1], state, self.method.decode(sample, available), self.env_params)
+            )(keys_now[:, 1], state, self.method.decode(sample, available, table), self.env_params)
             metrics = {
                 name: jnp.where(is_over, old, self._metric(name, info, t))
                 for name, old in metrics.items()

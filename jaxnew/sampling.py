@@ -13,12 +13,17 @@ class AvailableSet:
     """What an agent may choose from.
 
     Attributes:
-      ids: int32[m] action ids; padding repeats a valid id.
-      mask: bool[m] true for a real entry.
+      ids: int32[..., m] action ids; padding repeats a valid id.
+      mask: bool[..., m] true for a real entry.
     """
 
     ids: jax.Array
     mask: jax.Array
+
+    def id_of(self, choice: jax.Array) -> jax.Array:
+        """int32[...] the ids behind choices int32[...] from these sets, or from this one set."""
+        ids = jnp.broadcast_to(self.ids, (*choice.shape, self.ids.shape[-1]))
+        return jnp.take_along_axis(ids, choice[..., None], axis=-1)[..., 0]
 
 
 @struct.dataclass

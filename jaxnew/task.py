@@ -58,12 +58,14 @@ class LoopConfig:
       chunk_updates: updates per compiled call.
       evaluate_every: updates between evaluations on train and validation sets.
       evaluation_episodes: episodes per evaluation and split.
+      evaluation_set_size: actions in its sets; 0 for as many as in training.
       checkpoint_every: updates between `latest` checkpoints.
     """
 
     chunk_updates: int = 5
     evaluate_every: int = 25
     evaluation_episodes: int = 640
+    evaluation_set_size: int = 0
     checkpoint_every: int = 50
 
 
@@ -89,6 +91,21 @@ class StageTwoBudget:
 
 
 @dataclass(frozen=True)
+class Baselines:
+    """Where the paper's baselines differ from domain to domain (spec method 8).
+
+    Attributes:
+      continuous_rollout_share: steps per update of the continuous output over those of ours.
+      sums_gaussian_entropy: its entropy is summed over dimensions instead of averaged.
+      fixed_set: `train ids -> ids` of the one set that "without subsampling" is trained with.
+    """
+
+    continuous_rollout_share: float = 1.0
+    sums_gaussian_entropy: bool = False
+    fixed_set: Callable[[np.ndarray], np.ndarray] = lambda train_ids: train_ids
+
+
+@dataclass(frozen=True)
 class Task:
     """A domain. Modules in `experiments/tasks/` define one called `TASK`.
 
@@ -101,6 +118,7 @@ class Task:
       play: recordings of actions, or None for a domain whose representations are given.
       stage_one, stage_two: presets by budget.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
+      baselines: settings of the paper's baselines.
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
@@ -115,6 +133,7 @@ class Task:
     stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
     split_seed: int = 0
     selection_metric: str = "is_success"
+    baselines: Baselines = field(default_factory=Baselines)
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
 

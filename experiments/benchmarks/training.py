@@ -90,7 +90,12 @@ class WithoutGradient(Learner):
     """Gradients are a number that depends on every entry of the minibatch."""
 
     def _gradient(
-        self, params: Any, minibatch: Minibatch, hyperparameters: Hyperparameters, table: jax.Array
+        self,
+        params: Any,
+        minibatch: Minibatch,
+        hyperparameters: Hyperparameters,
+        table: jax.Array,
+        fixed_set: AvailableSet | None = None,
     ) -> tuple[Any, dict[str, jax.Array]]:
         total = sum(jnp.sum(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(minibatch))
         total = jnp.asarray(total) * 1e-6

@@ -14,7 +14,7 @@ from jaxnew.observations import RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
 from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import LoopConfig, Play, StageOneBudget, StageTwoBudget, Task
+from jaxnew.task import Baselines, LoopConfig, Play, StageOneBudget, StageTwoBudget, Task
 
 
 def _record_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
@@ -117,6 +117,7 @@ TASK = Task(
             cost="half an hour",
         ),
     },
+    baselines=Baselines(continuous_rollout_share=0.5, sums_gaussian_entropy=True),
     paper_environment="Grid World",
     representation_targets=_targets,
 )

@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import jax
+import numpy as np
 
 from jaxnew.environment import Action
-from jaxnew.policy.utility import UtilityMethod
+from jaxnew.policy.continuous import ContinuousMethod
+from jaxnew.policy.discrete import DiscreteMethod
+from jaxnew.policy.utility import RandomMethod, UtilityMethod
 from jaxnew.sampling import AvailableSet
 
 Params = Any
@@ -32,6 +36,9 @@ class PolicyMethod(Protocol):
     `project` is the part that depends on an action alone. It is computed once per gradient step for
     the whole table; the rows of the available actions are then gathered and handed to
     `distribution`. A method with no such part returns the representations unchanged.
+
+    `decode` turns a sample into an action of the available set; `table` f32[A, d] holds the
+    representations of all actions, for methods whose sample is not a choice from the set.
     """
 
     name: str
@@ -46,18 +53,37 @@ class PolicyMethod(Protocol):
 
     def value(self, params: Params, obs: jax.Array) -> jax.Array: ...
 
-    def decode(self, sample: Any, available: AvailableSet) -> Action: ...
+    def decode(self, sample: Any, available: AvailableSet, table: jax.Array) -> Action: ...
 
 
-METHODS: dict[str, Callable[[], PolicyMethod]] = {"ours": UtilityMethod}
+@dataclass(frozen=True)
+class MethodContext:
+    """What some methods must know of the run.
+
+    Attributes:
+      train_ids: int32[n] ids of the fixed action space of a discrete policy.
+      sums_gaussian_entropy: whether the entropy of a continuous output is summed over its
+        dimensions, as in Grid World, or averaged, as elsewhere (spec method 8.1).
+    """
+
+    train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
+    sums_gaussian_entropy: bool = False
 
 
-def make_method(name: str) -> PolicyMethod:
+METHODS: dict[str, Callable[[MethodContext], PolicyMethod]] = {
+    "ours": lambda context: UtilityMethod(),
+    "continuous": lambda context: ContinuousMethod(context.sums_gaussian_entropy),
+    "discrete": lambda context: DiscreteMethod(context.train_ids),
+    "random": lambda context: RandomMethod(),
+}
+
+
+def make_method(name: str, context: MethodContext | None = None) -> PolicyMethod:
     """The policy method called `name`.
 
     Raises:
-      ValueError: there is none of that name.
+      ValueError: there is none of that name, or `context` lacks what it needs.
     """
     if name not in METHODS:
         raise ValueError(f"Unknown method {name!r}; choose one of {sorted(METHODS)}.")
-    return METHODS[name]()
+    return METHODS[name](context or MethodContext())

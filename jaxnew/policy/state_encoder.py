@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any, cast
+
 import flax.linen as nn
 import jax
 import numpy as np
@@ -30,3 +32,8 @@ class VectorCritic(nn.Module):
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
         return orthogonal_dense(1, _SQRT_2, "value")(VectorEncoder()(obs))[..., 0]
+
+
+def apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:
+    """The output of `module` with `params`."""
+    return cast(jax.Array, module.apply({"params": params}, *inputs, **options))

@@ -13,7 +13,7 @@ is left per state and action is an addition, a ReLU and a dot product with 64 nu
 
 from __future__ import annotations
 
-from typing import Any, cast
+from typing import Any
 
 import flax.linen as nn
 import jax
@@ -21,7 +21,7 @@ import jax.numpy as jnp
 
 from jaxnew.environment import Action
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorCritic, VectorEncoder
+from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorCritic, VectorEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 HIDDEN_SIZE = 64
@@ -84,7 +84,7 @@ class UtilityMethod:
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., 64]: all that the policy needs of an action, in any state."""
-        return self._apply(self._utility, params["utility"], representations, method="project")
+        return apply(self._utility, params["utility"], representations, method="project")
 
     def distribution(
         self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
@@ -97,18 +97,33 @@ class UtilityMethod:
           projected: f32[..., m, 64] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
-        features = self._apply(self._encoder, params["encoder"], obs)
-        utilities = self._apply(self._utility, params["utility"], features, projected)
+        features = apply(self._encoder, params["encoder"], obs)
+        utilities = apply(self._utility, params["utility"], features, projected)
         return Categorical.masked(utilities, mask)
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[...] value of f32[..., n] normalised observations."""
-        return self._apply(self._critic, params["critic"], obs)
+        return apply(self._critic, params["critic"], obs)
 
-    def decode(self, sample: jax.Array, available: AvailableSet) -> Action:
+    def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The action behind a choice int32[...] from sets [..., m]."""
-        return Action.of(jnp.take_along_axis(available.ids, sample[..., None], axis=-1)[..., 0])
+        del table
+        return Action.of(available.id_of(sample))
 
-    @staticmethod
-    def _apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:
-        return cast(jax.Array, module.apply({"params": params}, *inputs, **options))
+
+class RandomMethod(UtilityMethod):
+    """Uniform over the available actions, whatever its parameters. For reference; does not learn.
+
+    The release draws logits from U(0, 1) anew at every step (spec method 5.5): as they are
+    exchangeable, every action is as likely as any other.
+    """
+
+    name = "random"
+
+    def distribution(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Categorical:
+        """The uniform distribution over the real entries."""
+        del params, projected
+        logits = jnp.zeros((*obs.shape[:-1], mask.shape[-1]))
+        return Categorical.masked(logits, mask)

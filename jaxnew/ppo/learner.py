@@ -15,7 +15,7 @@ from jaxnew.ppo.advantages import gae
 from jaxnew.ppo.objective import Hyperparameters, Minibatch, loss, normalize_advantages
 from jaxnew.rollout.batch import RolloutBatch
 from jaxnew.rollout.device import DeviceRollout, RolloutConfig, RolloutState
-from jaxnew.sampling import ActionPool
+from jaxnew.sampling import ActionPool, AvailableSet
 
 Metrics = dict[str, jax.Array]
 
@@ -160,7 +160,14 @@ class Learner:
             key_rollout, state.rollout, state.params, table, pool, hyperparameters.discount
         )
         params, opt_state, metrics = self.learn(
-            key_learn, state.params, state.opt_state, batch, hyperparameters, table, state.step
+            key_learn,
+            state.params,
+            state.opt_state,
+            batch,
+            hyperparameters,
+            table,
+            state.step,
+            rollout.available if batch.available is None else None,
         )
         metrics |= {f"episodes/{name}": value for name, value in sums.items()}
         next_state = TrainState(params, opt_state, rollout, state.key, state.step + 1)
@@ -194,6 +201,7 @@ class Learner:
         hyperparameters: Hyperparameters,
         table: jax.Array,
         step: jax.Array,
+        fixed_set: AvailableSet | None = None,
     ) -> tuple[Any, Any, Metrics]:
         """Gradient steps on one rollout; consumes `key`. Returns (params, opt_state, metrics)."""
         terminated = batch.done if self.config.time_limits_are_ends else batch.terminated
@@ -221,7 +229,7 @@ class Learner:
         def gradient_step(carry: tuple[Any, Any], indices: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
             minibatch = jax.tree.map(lambda x: x[indices], transitions)
-            grads, metrics = self._gradient(params, minibatch, hyperparameters, table)
+            grads, metrics = self._gradient(params, minibatch, hyperparameters, table, fixed_set)
             updates, opt_state = self.optimizer.update(grads, opt_state, params)
             params = optax.apply_updates(
                 params, jax.tree.map(lambda u: -learning_rate * u, updates)
@@ -263,6 +271,7 @@ class Learner:
         minibatch: Minibatch,
         hyperparameters: Hyperparameters,
         table: jax.Array,
+        fixed_set: AvailableSet | None = None,
     ) -> tuple[Any, Metrics]:
         """Gradient of the minibatch's loss, and the metrics of it.
 
@@ -273,7 +282,7 @@ class Learner:
 
         def gradient_of(part: Minibatch) -> tuple[Any, Metrics]:
             return jax.grad(loss, argnums=(0, 1), has_aux=True)(
-                params, projected_table, part, self.method, hyperparameters
+                params, projected_table, part, self.method, hyperparameters, fixed_set
             )
 
         size = self.config.microbatch_size

@@ -39,7 +39,7 @@ class Minibatch:
 
     Attributes:
       observation: f32[B, ...] normalised.
-      available: sets [B, m].
+      available: sets [B, m], or None where one set is in force in all of them.
       sample: what the policy drew, a pytree.
       log_prob: f32[B] its log-probability then.
       value: f32[B] value then.
@@ -48,7 +48,7 @@ class Minibatch:
     """
 
     observation: jax.Array
-    available: AvailableSet
+    available: AvailableSet | None
     sample: Any
     log_prob: jax.Array
     value: jax.Array
@@ -70,6 +70,7 @@ def loss(
     minibatch: Minibatch,
     method: PolicyMethod,
     hyperparameters: Hyperparameters,
+    fixed_set: AvailableSet | None = None,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate, clipped value loss and entropy bonus, means over the minibatch.
 
@@ -80,15 +81,16 @@ def loss(
       minibatch: B transitions.
       method: the policy.
       hyperparameters: traced weights.
+      fixed_set: [n] what is available where the minibatch does not say.
 
     Returns:
       The total loss f32[] and its parts, for the log.
     """
+    available = fixed_set if minibatch.available is None else minibatch.available
+    if available is None:
+        raise ValueError("The minibatch has no sets, and no fixed set is given.")
     distribution = method.distribution(
-        params,
-        minibatch.observation,
-        projected_table[minibatch.available.ids],
-        minibatch.available.mask,
+        params, minibatch.observation, projected_table[available.ids], available.mask
     )
     log_ratio = distribution.log_prob(minibatch.sample) - minibatch.log_prob
     ratio = jnp.exp(log_ratio)

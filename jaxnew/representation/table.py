@@ -162,6 +162,23 @@ def engineered_table(universe: ActionUniverse, name: str) -> RepresentationTable
     )
 
 
+def random_table(universe: ActionUniverse, size: int, seed: int) -> RepresentationTable:
+    """Vectors from N(0, I) that say nothing of what actions do, f32[A, size]; for reference.
+
+    Raises:
+      ValueError: `size` < 1.
+    """
+    if size < 1:
+        raise ValueError(f"Random vectors need a size of at least 1, got {size}.")
+    vectors = np.random.default_rng(seed).normal(size=(universe.num_actions, size))
+    return RepresentationTable(
+        vectors=vectors.astype(np.float32),
+        ids=np.arange(universe.num_actions, dtype=np.int32),
+        universe_hash=universe.hash,
+        source=f"random:{size}, seed {seed}",
+    )
+
+
 def _read_npz(path: Path) -> dict[str, np.ndarray]:
     """The arrays of a file that has at least `ids` and `vectors`."""
     try:

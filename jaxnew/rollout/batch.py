@@ -16,7 +16,8 @@ class RolloutBatch:
 
     Attributes:
       observation: f32[T, N, ...] as the policy saw it (normalised).
-      available: sets [T, N, m] in force at each step.
+      available: sets [T, N, m] in force at each step; None where one set stays in force for ever
+        (`RolloutConfig.has_fixed_set`), which is not stored for every step.
       sample: what the policy's distribution drew, a pytree.
       log_prob: f32[T, N] log-probability of the sample when it was drawn.
       value: f32[T, N] value of the observation.
@@ -27,7 +28,7 @@ class RolloutBatch:
     """
 
     observation: jax.Array
-    available: AvailableSet
+    available: AvailableSet | None
     sample: Any
     log_prob: jax.Array
     value: jax.Array

@@ -13,7 +13,7 @@ from jaxnew.environment import Environment, Info
 from jaxnew.policy import PolicyMethod
 from jaxnew.rollout.batch import RolloutBatch
 from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, AvailableSet, draw_sets
+from jaxnew.sampling import ActionPool, AvailableSet, draw_sets, whole_pool
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class RolloutConfig:
       num_steps: T, steps of each per update.
       set_size: m, actions available in an episode.
       padded_set_size: width of the sets; entries past `set_size` are masked. 0 means `set_size`.
+      has_fixed_set: the whole pool is available in every episode; the two sizes are not used.
       normalize_observations: running normalisation (vector-state domains).
       normalize_rewards: division by the running deviation of the discounted return.
       bootstraps_time_limits: value the final observation of truncated episodes; needed only if the
@@ -35,6 +36,7 @@ class RolloutConfig:
     num_steps: int = 512
     set_size: int = 50
     padded_set_size: int = 0
+    has_fixed_set: bool = False
     normalize_observations: bool = True
     normalize_rewards: bool = True
     bootstraps_time_limits: bool = False
@@ -57,7 +59,7 @@ class RolloutState:
     Attributes:
       env_state: environment states, [N, ...].
       observation: f32[N, ...] next input of the policy.
-      available: sets [N, m] in force.
+      available: sets [N, m] in force, or the fixed set [n].
       observation_statistics: running statistics of raw observations.
       return_statistics: running statistics of discounted returns.
       discounted_return: f32[N] return of the running episodes, for `return_statistics`.
@@ -90,7 +92,9 @@ class DeviceRollout:
         return RolloutState(
             env_state=env_state,
             observation=obs,
-            available=self._draw(key_sets, (self.config.num_envs,), pool),
+            available=whole_pool(pool)
+            if self.config.has_fixed_set
+            else self._draw(key_sets, (self.config.num_envs,), pool),
             observation_statistics=statistics,
             return_statistics=RunningStatistics.zeros(()),
             discounted_return=jnp.zeros(self.config.num_envs),
@@ -120,18 +124,22 @@ class DeviceRollout:
           of the environment's `episode_metrics`.
         """
         key_sets, key_steps = jax.random.split(key)
-        # A set for every step, used where an episode ends: one batched draw costs far less than
-        # num_steps small ones inside the scan.
         shape = (self.config.num_steps, self.config.num_envs)
-        next_sets = self._draw(key_sets, shape, pool)
         key_samples, key_envs = jax.random.split(key_steps)
         keys = (jax.random.split(key_samples, shape[0]), jax.random.split(key_envs, shape))
         projected_table = self.method.project(params, table)
+        if self.config.has_fixed_set:
+            next_sets, fixed_rows = None, projected_table[state.available.ids]
+        else:
+            # A set for every step, used where an episode ends: one batched draw costs far less
+            # than num_steps small ones inside the scan.
+            next_sets, fixed_rows = self._draw(key_sets, shape, pool), None
 
         def step(
-            state: RolloutState, inputs: tuple[tuple[jax.Array, jax.Array], AvailableSet]
+            state: RolloutState, inputs: tuple[tuple[jax.Array, jax.Array], AvailableSet | None]
         ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
-            return self._step(inputs[0], state, params, projected_table, inputs[1], discount)
+            rows = projected_table[state.available.ids] if fixed_rows is None else fixed_rows
+            return self._step(inputs[0], state, params, table, rows, inputs[1], discount)
 
         state, (batch, final_values, info) = jax.lax.scan(step, state, (keys, next_sets))
         last_value = self.method.value(params, state.observation)
@@ -148,13 +156,14 @@ class DeviceRollout:
         keys: tuple[jax.Array, jax.Array],
         state: RolloutState,
         params: Any,
-        projected_table: jax.Array,
-        next_set: AvailableSet,
+        table: jax.Array,
+        projected: jax.Array,
+        next_set: AvailableSet | None,
         discount: jax.Array | float,
     ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
         key_sample, keys_env = keys
         distribution = self.method.distribution(
-            params, state.observation, projected_table[state.available.ids], state.available.mask
+            params, state.observation, projected, state.available.mask
         )
         sample = distribution.sample(key_sample)
         value = self.method.value(params, state.observation)
@@ -163,7 +172,7 @@ class DeviceRollout:
         )(
             keys_env,
             state.env_state,
-            self.method.decode(sample, state.available),
+            self.method.decode(sample, state.available, table),
             self.env_params,
         )
         done = terminated | truncated
@@ -177,7 +186,7 @@ class DeviceRollout:
         )
         batch = RolloutBatch(
             observation=state.observation,
-            available=state.available,
+            available=None if next_set is None else state.available,
             sample=sample,
             log_prob=distribution.log_prob(sample),
             value=value,
@@ -186,9 +195,11 @@ class DeviceRollout:
             terminated=terminated,
             done=done,
         )
-        available = jax.tree.map(
-            lambda new, old: jnp.where(done[:, None], new, old), next_set, state.available
-        )
+        available = state.available
+        if next_set is not None:
+            available = jax.tree.map(
+                lambda new, old: jnp.where(done[:, None], new, old), next_set, available
+            )
         next_state = RolloutState(
             env_state=env_state,
             observation=obs,

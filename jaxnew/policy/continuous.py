@@ -1,0 +1,105 @@
+"""The continuous-output baseline: a point in the space of representations (spec method 8.1)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from jaxnew.environment import Action
+from jaxnew.policy._nearest import nearest_id
+from jaxnew.policy.state_encoder import VectorCritic, VectorEncoder, apply, orthogonal_dense
+from jaxnew.sampling import AvailableSet
+
+_LOG_TWO_PI = 1.8378770664093453
+_LOG_PROB_BOUND = 1e5  # Spec method 8.1: only ever reached in the hybrid environments.
+
+
+@struct.dataclass
+class DiagonalGaussian:
+    """A normal distribution over f32[..., d] with independent dimensions.
+
+    Attributes:
+      mean: f32[..., d].
+      variance: f32[..., d], positive.
+      sums_entropy: whether `entropy` is summed over the d dimensions or averaged.
+    """
+
+    mean: jax.Array
+    variance: jax.Array
+    sums_entropy: bool = struct.field(pytree_node=False, default=False)
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """f32[..., d]; consumes `key`."""
+        return self.mean + jnp.sqrt(self.variance) * jax.random.normal(key, self.mean.shape)
+
+    def log_prob(self, sample: jax.Array) -> jax.Array:
+        """f32[...] joint log-density of a sample f32[..., d]."""
+        squares = (sample - self.mean) ** 2 / self.variance
+        log_prob = -0.5 * jnp.sum(squares + jnp.log(self.variance) + _LOG_TWO_PI, axis=-1)
+        return jnp.clip(log_prob, -_LOG_PROB_BOUND, _LOG_PROB_BOUND)
+
+    def entropy(self) -> jax.Array:
+        """f32[...] entropy in nats, of all dimensions or per dimension."""
+        per_dimension = 0.5 * (1.0 + _LOG_TWO_PI + jnp.log(self.variance))
+        reduce = jnp.sum if self.sums_entropy else jnp.mean
+        return reduce(per_dimension, axis=-1)
+
+    def mode(self) -> jax.Array:
+        """f32[..., d]."""
+        return self.mean
+
+
+class _GaussianPolicy(nn.Module):
+    """Observation f32[..., n] -> mean and variance, f32[..., d] each."""
+
+    size: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
+        features = VectorEncoder(name="encoder")(obs)
+        mean = orthogonal_dense(self.size, 1.0, "mean")(features)
+        return mean, nn.softplus(orthogonal_dense(self.size, 1.0, "variance")(features))
+
+
+class ContinuousMethod:
+    """Samples a point; the nearest available action is taken. PPO runs on the point."""
+
+    name = "continuous"
+
+    def __init__(self, sums_entropy: bool = False) -> None:
+        self._sums_entropy = sums_entropy
+        self._critic = VectorCritic()
+
+    def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
+        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        key_policy, key_critic = jax.random.split(key)
+        return {
+            "policy": _GaussianPolicy(representation_size).init(key_policy, obs)["params"],
+            "critic": self._critic.init(key_critic, obs)["params"],
+        }
+
+    def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
+        """The representations themselves."""
+        del params
+        return representations
+
+    def distribution(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> DiagonalGaussian:
+        """The policy over points f32[..., d]; it does not see the available actions."""
+        del mask
+        policy = _GaussianPolicy(projected.shape[-1])
+        both = apply(policy, params["policy"], obs)
+        return DiagonalGaussian(both[0], both[1], self._sums_entropy)
+
+    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[...] value of f32[..., n] normalised observations."""
+        return apply(self._critic, params["critic"], obs)
+
+    def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
+        """The available action nearest to each point."""
+        return Action.of(nearest_id(sample, available, table))

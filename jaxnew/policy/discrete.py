@@ -1,0 +1,79 @@
+"""A discrete policy over the train actions; elsewhere the nearest action acts (spec method 8.2)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnew.environment import Action
+from jaxnew.policy._nearest import nearest_id
+from jaxnew.policy.distributions import Categorical
+from jaxnew.policy.state_encoder import VectorCritic, VectorEncoder, apply, orthogonal_dense
+from jaxnew.sampling import AvailableSet
+
+_HEAD_GAIN = 0.01  # Spec method 8.2.
+
+
+class _DiscretePolicy(nn.Module):
+    """Observation f32[..., n] -> logits f32[..., num_actions]."""
+
+    num_actions: int
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        features = VectorEncoder(name="encoder")(obs)
+        return orthogonal_dense(self.num_actions, _HEAD_GAIN, "logits")(features)
+
+
+class DiscreteMethod:
+    """One logit per train action. Its sample is an index into `train_ids`.
+
+    What acts is the available action whose representation is nearest to that of the sampled train
+    action: where all train actions are available, that action itself.
+
+    Raises:
+      ValueError: there is no train action.
+    """
+
+    name = "discrete"
+
+    def __init__(self, train_ids: np.ndarray) -> None:
+        if len(train_ids) == 0:
+            raise ValueError("The discrete method needs the ids of the actions it is trained on.")
+        self._train_ids = np.asarray(train_ids, np.int32)
+        self._policy = _DiscretePolicy(len(train_ids))
+        self._critic = VectorCritic()
+
+    def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
+        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        del representation_size
+        key_policy, key_critic = jax.random.split(key)
+        return {
+            "policy": self._policy.init(key_policy, obs)["params"],
+            "critic": self._critic.init(key_critic, obs)["params"],
+        }
+
+    def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
+        """The representations themselves."""
+        del params
+        return representations
+
+    def distribution(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Categorical:
+        """The policy over the train actions; it does not see the available ones."""
+        del projected, mask
+        return Categorical(apply(self._policy, params["policy"], obs))
+
+    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[...] value of f32[..., n] normalised observations."""
+        return apply(self._critic, params["critic"], obs)
+
+    def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
+        """The available action nearest to the sampled train action."""
+        wanted = table[jnp.asarray(self._train_ids)[sample]]
+        return Action.of(nearest_id(wanted, available, table))
