@@ -57,10 +57,10 @@ def variant_of(name: str) -> Variant:
     return VARIANTS[name]
 
 
-def train_ids_of(name: str, task: Task, split: ActionSplit) -> np.ndarray:
-    """int32[n] the actions that a method is trained with."""
-    variant = variant_of(name)
-    return task.baselines.fixed_set(split.train) if variant.scores_fixed_set else split.train
+def trained_ids(name: str, task: Task, split: ActionSplit, part: str = "train") -> np.ndarray:
+    """int32[n] the actions of a part of the split that a method is trained with."""
+    ids = split.ids(part)
+    return task.baselines.fixed_set(ids) if variant_of(name).scores_fixed_set else ids
 
 
 def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -> StageTwoBudget:
@@ -73,7 +73,7 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
         rollout = replace(rollout, num_steps=round(rollout.num_steps * share))
         budget = replace(budget, num_updates=round(budget.num_updates / share))
     if variant.scores_fixed_set and ppo.microbatch_size:
-        wanted = _FIXED_SET_NUMBERS // len(train_ids_of(name, task, split))
+        wanted = _FIXED_SET_NUMBERS // len(trained_ids(name, task, split))
         size = 2 ** max(2, int(np.log2(max(1, wanted))))
         ppo = replace(ppo, microbatch_size=min(size, ppo.microbatch_size))
     if variant.is_without_entropy:
@@ -81,10 +81,10 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
     return replace(budget, ppo=replace(ppo, rollout=rollout), hyperparameters=hyperparameters)
 
 
-def method_of(name: str, task: Task, split: ActionSplit) -> PolicyMethod:
-    """The policy behind a variant."""
+def method_of(name: str, task: Task, split: ActionSplit, part: str = "train") -> PolicyMethod:
+    """The policy behind a variant that is trained with a part of the split."""
     context = MethodContext(
-        train_ids=train_ids_of(name, task, split),
+        train_ids=trained_ids(name, task, split, part),
         sums_gaussian_entropy=task.baselines.sums_gaussian_entropy,
     )
     return make_method(variant_of(name).policy, context)

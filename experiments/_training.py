@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
-from experiments._methods import adapted, method_of, train_ids_of
+from experiments._methods import adapted, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit
@@ -32,7 +32,12 @@ SPLITS_WATCHED = ("train", "validation")
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """All that fixes a policy's run."""
+    """All that fixes a policy's run.
+
+    Attributes:
+      trained_on: part of the split whose actions it is trained with.
+      start: what `finetune` begins with, or "fresh parameters".
+    """
 
     task: str
     method: str
@@ -45,6 +50,8 @@ class TrainConfig:
     ppo: PPOConfig
     hyperparameters: Hyperparameters
     loop: LoopConfig
+    trained_on: str = "train"
+    start: str = "fresh parameters"
 
     @classmethod
     def of(
@@ -102,7 +109,7 @@ class Trainer:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
         env = task.make_environment()
-        method = method_of(config.method, task, split)
+        method = method_of(config.method, task, split, config.trained_on)
         vectors = table.rows(np.arange(env.action_spec.num_actions))
         rollout_config = config.ppo.rollout
         pools = {
@@ -113,7 +120,7 @@ class Trainer:
         }
         training_pool = pools["train"]
         if rollout_config.has_fixed_set:
-            fixed = train_ids_of(config.method, task, split)
+            fixed = trained_ids(config.method, task, split, config.trained_on)
             training_pool = ActionPool.of(
                 fixed, capacity=len(fixed), always_available=split.always_available
             )
@@ -179,8 +186,8 @@ class Trainer:
         return results
 
     def on_split(self, name: str, evaluator: Evaluator) -> tuple[Evaluator, ActionPool]:
-        """What evaluates a split: where training has a fixed set, train episodes have all of it."""
-        if name == "train" and self.config.ppo.rollout.has_fixed_set:
+        """What evaluates a part of the split: all of the fixed set where training has one."""
+        if name == self.config.trained_on and self.config.ppo.rollout.has_fixed_set:
             return self._fixed_evaluator, self.training_pool
         return evaluator, self.pools[name]
 

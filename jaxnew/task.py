@@ -97,12 +97,15 @@ class Baselines:
     Attributes:
       continuous_rollout_share: steps per update of the continuous output over those of ours.
       sums_gaussian_entropy: its entropy is summed over dimensions instead of averaged.
-      fixed_set: `train ids -> ids` of the one set that "without subsampling" is trained with.
+      fixed_set: `ids -> ids` of the one set that the utility policy scores where it is trained
+        without subsampling.
+      finetune_share: updates of fine-tuning on new actions over those of training (spec method 9).
     """
 
     continuous_rollout_share: float = 1.0
     sums_gaussian_entropy: bool = False
-    fixed_set: Callable[[np.ndarray], np.ndarray] = lambda train_ids: train_ids
+    fixed_set: Callable[[np.ndarray], np.ndarray] = lambda ids: ids
+    finetune_share: float = 1.0
 
 
 @dataclass(frozen=True)

@@ -117,7 +117,9 @@ TASK = Task(
             cost="half an hour",
         ),
     },
-    baselines=Baselines(continuous_rollout_share=0.5, sums_gaussian_entropy=True),
+    baselines=Baselines(
+        continuous_rollout_share=0.5, sums_gaussian_entropy=True, finetune_share=0.25
+    ),
     paper_environment="Grid World",
     representation_targets=_targets,
 )

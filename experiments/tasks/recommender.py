@@ -21,9 +21,9 @@ _HYPERPARAMETERS = Hyperparameters(entropy_coefficient=0.01)
 _LOOP = LoopConfig(evaluate_every=20, evaluation_episodes=160, evaluation_set_size=50)
 
 
-def _fixed_set(train_ids: np.ndarray) -> np.ndarray:
-    """2,000 of the train products, drawn once (spec recommender 5)."""
-    return np.random.RandomState(42).choice(train_ids, 2000, replace=False)
+def _fixed_set(ids: np.ndarray) -> np.ndarray:
+    """2,000 of the products, drawn once (spec recommender 5, method 9)."""
+    return np.random.RandomState(42).choice(ids, 2000, replace=False)
 
 
 TASK = Task(

@@ -27,6 +27,7 @@ class RolloutConfig:
       padded_set_size: width of the sets; entries past `set_size` are masked. 0 means `set_size`.
       has_fixed_set: the whole pool is available in every episode; the two sizes are not used.
       normalize_observations: running normalisation (vector-state domains).
+      freezes_observation_statistics: the statistics that `init` is given are never updated.
       normalize_rewards: division by the running deviation of the discounted return.
       bootstraps_time_limits: value the final observation of truncated episodes; needed only if the
         learner does not treat time limits as ends.
@@ -38,6 +39,7 @@ class RolloutConfig:
     padded_set_size: int = 0
     has_fixed_set: bool = False
     normalize_observations: bool = True
+    freezes_observation_statistics: bool = False
     normalize_rewards: bool = True
     bootstraps_time_limits: bool = False
 
@@ -82,12 +84,17 @@ class DeviceRollout:
     method: PolicyMethod
     config: RolloutConfig
 
-    def init(self, key: jax.Array, pool: ActionPool) -> RolloutState:
-        """Starts every environment; consumes `key`."""
+    def init(
+        self,
+        key: jax.Array,
+        pool: ActionPool,
+        observation_statistics: RunningStatistics | None = None,
+    ) -> RolloutState:
+        """Starts every environment, from fresh statistics or from given ones; consumes `key`."""
         key_reset, key_sets = jax.random.split(key)
         keys = jax.random.split(key_reset, self.config.num_envs)
         raw_obs, env_state = jax.vmap(self.env.reset, in_axes=(0, None))(keys, self.env_params)
-        statistics = RunningStatistics.zeros(raw_obs.shape[1:])
+        statistics = observation_statistics or RunningStatistics.zeros(raw_obs.shape[1:])
         obs, statistics = self._observe(raw_obs, statistics)
         return RolloutState(
             env_state=env_state,
@@ -219,7 +226,7 @@ class DeviceRollout:
         self, raw_obs: jax.Array, statistics: RunningStatistics
     ) -> tuple[jax.Array, RunningStatistics]:
         """Updates the statistics with a batch and normalises it with the result."""
-        if self.config.normalize_observations:
+        if self.config.normalize_observations and not self.config.freezes_observation_statistics:
             statistics = statistics.update(raw_obs)
         return self._normalize(raw_obs, statistics), statistics
 
