@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import re
@@ -20,7 +19,7 @@ from experiments._flags import load_task
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
-from tests.experiments.commands import ROOT, run
+from tests.experiments.commands import ROOT, read_json, run
 
 pytestmark = pytest.mark.integration
 
@@ -44,10 +43,6 @@ def hvae_run(runs: Path) -> Path:
 @pytest.fixture(scope="module")
 def encoder_run(hvae_run: Path) -> Path:
     return hvae_run.parent / "embed-hvae-relative-default-smoke-31"
-
-
-def read_json(path: Path) -> dict:
-    return json.loads(path.read_text())
 
 
 def test_a_run_directory_explains_itself(hvae_run: Path, encoder_run: Path) -> None:

@@ -1,0 +1,107 @@
+"""The methods of the paper through the commands: train, reload, evaluate, fine-tune."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from experiments._artifacts import Domain
+from experiments._flags import UsageError, load_task
+from experiments._methods import VARIANTS, adapted, trained_ids, variant_of
+from jaxnew import metrics
+from tests.experiments.commands import read_json, run
+
+TASKS = ("grid_world", "recommender")
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("runs")
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("task", "representation", "method", "sizes"),
+    [
+        ("grid_world", "gt12", "continuous", (50, 50)),
+        ("grid_world", "gt12", "no-subsampling", (512, 50)),
+        ("grid_world", "random-3", "no-entropy", (50, 50)),
+        ("recommender", "product", "ours", (50, 50)),
+        ("recommender", "product-mu", "nearest-neighbour", (5000, 50)),
+    ],
+)
+def test_methods_train_and_are_evaluated(
+    runs: Path, task: str, representation: str, method: str, sizes: tuple[int, int]
+) -> None:
+    run(
+        "train",
+        f"--task={task}",
+        f"--method={method}",
+        f"--representation={representation}",
+        "--budget=smoke",
+        f"--runs={runs}",
+    )
+    path = runs / task / f"{method}-{representation}-default-smoke-31"
+    run("evaluate", f"--run={path}", "--sets=train,test", "--episodes=32")
+    for name, size in zip(("train", "test"), sizes, strict=True):
+        result = read_json(path / "evaluation" / f"{name}-best-sampled-m{size}.json")
+        assert result["set_size"] == size
+        assert result["num_episodes"] == 32
+
+
+@pytest.mark.integration
+def test_a_policy_goes_on_with_new_actions(runs: Path) -> None:
+    """Both kinds of policy, warm and from scratch; the discrete head is as large as its set."""
+    for method in ("ours", "nearest-neighbour"):
+        flags = ["--representation=gt12", "--budget=smoke", f"--method={method}"]
+        run("train", *flags, f"--runs={runs}")
+        path = runs / "grid_world" / f"{method}-gt12-default-smoke-31"
+        for start, flag in (("warm", []), ("scratch", ["--scratch"])):
+            run("finetune", f"--run={path}", "--budget=smoke", *flag)
+            folder = path / f"finetune-{start}-smoke-31"
+            assert read_json(folder / "config.json")["trained_on"] == "test"
+            assert metrics.read(folder)[-1]["step"] == 1
+    assert "cannot be fine-tuned" in run("finetune", f"--run={folder}", fails=True)
+
+
+@pytest.mark.unit
+def test_what_each_method_changes() -> None:
+    """Spec method 8, on the paper's budgets."""
+    for name in TASKS:
+        domain = Domain.of(load_task(name), None)
+        paper = domain.task.stage_two["paper"]
+        found = {m: adapted(paper, m, domain.task, domain.split) for m in VARIANTS}
+        assert found["ours"] == found["random"] == paper
+        assert found["no-entropy"].hyperparameters.entropy_coefficient == 0.0
+        assert paper.hyperparameters.entropy_coefficient > 0.0
+        for fixed in ("no-subsampling", "nearest-neighbour"):
+            assert found[fixed].ppo.rollout.has_fixed_set
+            assert found[fixed].num_updates == paper.num_updates
+        steps = {m: b.num_updates * b.ppo.steps_per_update for m, b in found.items()}
+        assert all(abs(s - steps["ours"]) <= paper.ppo.steps_per_update for s in steps.values())
+    with pytest.raises(UsageError, match="Unknown method 'our'; choose one of ours, "):
+        variant_of("our")
+
+
+@pytest.mark.unit
+def test_sizes_of_the_published_methods() -> None:
+    """Spec method 6 and 8: rollout lengths, minibatches and fixed sets."""
+    grid, reco = (Domain.of(load_task(name), None) for name in TASKS)
+    continuous = [
+        adapted(d.task.stage_two["paper"], "continuous", d.task, d.split).ppo for d in (grid, reco)
+    ]
+    assert [ppo.rollout.num_steps for ppo in continuous] == [256, 256]
+    assert [ppo.minibatch_size for ppo in continuous] == [2048, 2048]
+    numbers = [
+        len(trained_ids(method, d.task, d.split))
+        for method in ("no-subsampling", "nearest-neighbour")
+        for d in (grid, reco)
+    ]
+    assert numbers == [512, 2000, 512, 5000]
+    fixed = trained_ids("no-subsampling", reco.task, reco.split)
+    again = np.random.RandomState(42).choice(reco.split.train, 2000, replace=False)
+    np.testing.assert_array_equal(fixed, again)
+    assert grid.task.baselines.sums_gaussian_entropy
+    assert not reco.task.baselines.sums_gaussian_entropy
