@@ -73,18 +73,24 @@ TASK = Task(
     # the release's README suggests (64 recordings, 500 epochs of 4 steps).
     stage_one={
         "smoke": _stage_one(
-            16, replace(_HVAE, num_steps=8, recordings_per_action=4, actions_per_batch=16), 8, "s"
+            16,
+            replace(_HVAE, num_steps=8, recordings_per_action=4, actions_per_batch=16),
+            8,
+            "seconds",
         ),
         "laptop": _stage_one(
             256,
             replace(_HVAE, num_steps=800, recordings_per_action=32, actions_per_batch=32),
             400,
-            "minutes",
+            "about a minute on two cores",
         ),
         "fast": _stage_one(
-            1024, replace(_HVAE, num_steps=2000, recordings_per_action=64), 2000, "an hour"
+            1024,
+            replace(_HVAE, num_steps=2000, recordings_per_action=64),
+            2000,
+            "17 minutes on two cores",
         ),
-        "paper": _stage_one(1024, _HVAE, 10_000, "days"),
+        "paper": _stage_one(1024, _HVAE, 10_000, "60 hours on two cores"),
     },
     # Spec method 6, column Grid World.
     stage_two={
@@ -98,7 +104,7 @@ TASK = Task(
                 chunk_updates=2, evaluate_every=2, evaluation_episodes=64, checkpoint_every=2
             ),
             final_episodes=128,
-            cost="s",
+            cost="seconds",
         ),
         "laptop": StageTwoBudget(
             num_updates=500,
@@ -106,7 +112,7 @@ TASK = Task(
             hyperparameters=Hyperparameters(),
             loop=LoopConfig(),
             final_episodes=5000,
-            cost="minutes",
+            cost="about 4 minutes on two cores",
         ),
         "paper": StageTwoBudget(
             num_updates=2441,
@@ -114,7 +120,7 @@ TASK = Task(
             hyperparameters=Hyperparameters(),
             loop=LoopConfig(),
             final_episodes=5000,
-            cost="half an hour",
+            cost="about 15 minutes on two cores",
         ),
     },
     baselines=Baselines(
