@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments._flags import UsageError
 from jaxnew.actions import ActionSplit
-from jaxnew.policy.method import MethodContext, PolicyMethod, make_method
+from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method
 from jaxnew.task import StageTwoBudget, Task
 
 _FIXED_SET_NUMBERS = 2**14  # Scored action and state pairs per microbatch that stay in the caches.
@@ -47,14 +47,16 @@ VARIANTS = {
 
 
 def variant_of(name: str) -> Variant:
-    """The variant called `name`.
+    """The variant called `name`; a policy of `METHODS` is one without special settings.
 
     Raises:
       UsageError: there is none of that name.
     """
-    if name not in VARIANTS:
-        raise UsageError(f"Unknown method {name!r}; choose one of {', '.join(VARIANTS)}.")
-    return VARIANTS[name]
+    if name in VARIANTS:
+        return VARIANTS[name]
+    if name in METHODS:
+        return Variant(name)
+    raise UsageError(f"Unknown method {name!r}; choose one of {', '.join(VARIANTS)}.")
 
 
 def trained_ids(name: str, task: Task, split: ActionSplit, part: str = "train") -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from jaxnew.policy import METHODS, UtilityMethod, make_method
+from jaxnew.policy.method import MethodContext
 from jaxnew.policy.utility import Utility
 from jaxnew.sampling import AvailableSet
 from tests.jaxnew.policy import numpy_policy
@@ -222,7 +223,7 @@ def test_actor_and_critic_share_nothing(params: Any, inputs: Any) -> None:
 @pytest.mark.unit
 def test_decode_names_the_id_behind_the_choice() -> None:
     available = AvailableSet(jnp.array([[7, 3, 9], [4, 4, 1]]), jnp.ones((2, 3), bool))
-    action = METHOD.decode(jnp.array([2, 0]), available)
+    action = METHOD.decode(jnp.array([2, 0]), available, jnp.zeros((0, D)))
     assert action.id.tolist() == [9, 4]
     assert action.position.shape == (2, 0)
     assert action.stop.tolist() == [False, False]
@@ -232,6 +233,7 @@ def test_decode_names_the_id_behind_the_choice() -> None:
 def test_methods_by_name() -> None:
     assert isinstance(make_method("ours"), UtilityMethod)
     assert make_method("ours").name == "ours"
-    assert all(make_method(name).name == name for name in METHODS)
+    context = MethodContext(train_ids=np.arange(3))
+    assert all(make_method(name, context).name == name for name in METHODS)
     with pytest.raises(ValueError, match=r"Unknown method 'our'; choose one of .*'ours'"):
         make_method("our")
