@@ -146,6 +146,26 @@ def test_an_undisturbed_run(tmp_path: Path) -> None:
 
 
 @pytest.mark.unit
+def test_chunks_that_step_over_an_interval_are_followed_by_what_was_due(tmp_path: Path) -> None:
+    train(tmp_path, total_steps=10, chunk_steps=3, checkpoint_every=100, evaluate_every=4)
+    evaluated = [r["step"] for r in reports(tmp_path) if "validation/success" in r]
+    # Chunks end at 3, 6, 9 and 10: 4 and 8 are passed, 10 is the end.
+    assert evaluated == [6, 9, 10]
+
+
+@pytest.mark.unit
+def test_elapsed_time_goes_on_where_the_checkpoint_left_it(tmp_path: Path) -> None:
+    train(tmp_path, total_steps=10)
+    checkpointer = Checkpointer(tmp_path / "checkpoints")
+    state, metadata = checkpointer.restore("latest", init())
+    checkpointer.discard_after(-1)
+    checkpointer.save("latest", 10, state, {**metadata, "elapsed_s": 1000.0})
+    train(tmp_path, total_steps=15)
+    found = [r["time/elapsed_s"] for r in metrics.read(tmp_path) if "time/elapsed_s" in r]
+    assert 1000.0 <= found[-1] < 1100.0
+
+
+@pytest.mark.unit
 def test_a_complete_run_returns_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     first = train(tmp_path)
     before = outcome(tmp_path)

@@ -196,3 +196,9 @@ def test_an_edited_file_is_refused(tmp_path):
     np.savez(path, **{**arrays, "vectors": arrays["vectors"] + 1})
     with pytest.raises(ValueError, match="edited or damaged"):
         RepresentationTable.load(path)
+
+
+@pytest.mark.unit
+def test_rows_are_found_by_id_where_ids_have_gaps() -> None:
+    table = RepresentationTable(vectors=np.array([[2.0], [9.0], [4.0]]), ids=np.array([2, 9, 4]))
+    np.testing.assert_array_equal(table.rows(np.array([9, 2, 4])), [[9.0], [2.0], [4.0]])
