@@ -67,6 +67,8 @@ def plain_config(
             "learning_rate": learning_rate,
         },
         "loop": config_lib.to_dict(budget.loop),
+        "trained_on": "train",
+        "start": "fresh parameters",
     }
 
 
