@@ -227,7 +227,9 @@ class Sweep:
 
 def main() -> None:
     # Each core is a device; without effect on accelerators.
-    jax.config.update("jax_num_cpu_devices", len(os.sched_getaffinity(0)))
+    has_affinity = hasattr(os, "sched_getaffinity")  # Not on macOS.
+    num_cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
+    jax.config.update("jax_num_cpu_devices", num_cores)
     task = flag.load_task(flag.TASK.value)
     domain = Domain.of(task, flag.SPLIT.value)
     runs = Path(flag.RUNS.value)
