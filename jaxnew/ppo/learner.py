@@ -275,14 +275,15 @@ class Learner:
     ) -> tuple[Any, Metrics]:
         """Gradient of the minibatch's loss, and the metrics of it.
 
-        The table is projected once; microbatches add up the gradient of the projected rows, which
-        one backward pass then carries into the parameters of the projection.
+        What can be available is projected once; microbatches add up the gradient of the projected
+        rows, which one backward pass then carries into the parameters of the projection.
         """
-        projected_table, pull_back = jax.vjp(lambda p: self.method.project(p, table), params)
+        rows = table if fixed_set is None else table[fixed_set.ids]
+        projected, pull_back = jax.vjp(lambda p: self.method.project(p, rows), params)
 
         def gradient_of(part: Minibatch) -> tuple[Any, Metrics]:
             return jax.grad(loss, argnums=(0, 1), has_aux=True)(
-                params, projected_table, part, self.method, hyperparameters, fixed_set
+                params, projected, part, self.method, hyperparameters, fixed_set
             )
 
         size = self.config.microbatch_size
@@ -291,8 +292,8 @@ class Learner:
         else:
             parts = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), minibatch)
             grads, metrics = _mean_over(gradient_of, parts)
-        grads_direct, grad_table = grads
-        return jax.tree.map(jnp.add, grads_direct, pull_back(grad_table)[0]), metrics
+        grads_direct, grad_rows = grads
+        return jax.tree.map(jnp.add, grads_direct, pull_back(grad_rows)[0]), metrics
 
 
 def reduce_metrics(stacked: Metrics) -> Metrics:

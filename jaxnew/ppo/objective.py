@@ -66,7 +66,7 @@ def normalize_advantages(advantages: jax.Array) -> jax.Array:
 
 def loss(
     params: Any,
-    projected_table: jax.Array,
+    projected: jax.Array,
     minibatch: Minibatch,
     method: PolicyMethod,
     hyperparameters: Hyperparameters,
@@ -76,8 +76,8 @@ def loss(
 
     Args:
       params: of the policy.
-      projected_table: f32[A, p] `method.project(params, table)`; handed in, so that it is computed
-        once per gradient step.
+      projected: `method.project` of the table f32[A, p], or of the fixed set f32[n, p]; handed in,
+        so that it is computed once per gradient step.
       minibatch: B transitions.
       method: the policy.
       hyperparameters: traced weights.
@@ -89,9 +89,8 @@ def loss(
     available = fixed_set if minibatch.available is None else minibatch.available
     if available is None:
         raise ValueError("The minibatch has no sets, and no fixed set is given.")
-    distribution = method.distribution(
-        params, minibatch.observation, projected_table[available.ids], available.mask
-    )
+    rows = projected if minibatch.available is None else projected[available.ids]
+    distribution = method.distribution(params, minibatch.observation, rows, available.mask)
     log_ratio = distribution.log_prob(minibatch.sample) - minibatch.log_prob
     ratio = jnp.exp(log_ratio)
     clip = hyperparameters.clip

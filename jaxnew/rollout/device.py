@@ -134,18 +134,19 @@ class DeviceRollout:
         shape = (self.config.num_steps, self.config.num_envs)
         key_samples, key_envs = jax.random.split(key_steps)
         keys = (jax.random.split(key_samples, shape[0]), jax.random.split(key_envs, shape))
-        projected_table = self.method.project(params, table)
         if self.config.has_fixed_set:
-            next_sets, fixed_rows = None, projected_table[state.available.ids]
+            projected = self.method.project(params, table[state.available.ids])
+            next_sets = None
         else:
+            projected = self.method.project(params, table)
             # A set for every step, used where an episode ends: one batched draw costs far less
             # than num_steps small ones inside the scan.
-            next_sets, fixed_rows = self._draw(key_sets, shape, pool), None
+            next_sets = self._draw(key_sets, shape, pool)
 
         def step(
             state: RolloutState, inputs: tuple[tuple[jax.Array, jax.Array], AvailableSet | None]
         ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
-            rows = projected_table[state.available.ids] if fixed_rows is None else fixed_rows
+            rows = projected if next_sets is None else projected[state.available.ids]
             return self._step(inputs[0], state, params, table, rows, inputs[1], discount)
 
         state, (batch, final_values, info) = jax.lax.scan(step, state, (keys, next_sets))
