@@ -199,3 +199,45 @@ def _curve_legend(settings: Sequence[CurveSetting]) -> tuple[list[Any], list[str
         handles.append((Patch(color=PAPER_COLOR, alpha=0.15, linewidth=0), line))
         labels.append(f"{setting.paper_label}, held at best (mean ± std over seeds)")
     return handles, labels
+
+
+def reference_curves(
+    settings: Sequence[tuple[str, Color, Sequence[RunCurve]]],
+    lines: Sequence[tuple[str, float]],
+    metric: Metric,
+    title: str = "",
+) -> Figure:
+    """Curves against environment steps as they are, and horizontal lines.
+
+    Args:
+      settings: label, colour and runs of each; mean, and for several runs the deviation, are drawn.
+      lines: label and value; those whose label begins with `paper` have the paper's colour.
+      metric: of the vertical axis.
+      title: of the figure.
+    """
+    figure = new_figure(6.4, 4.4 + 0.09 * (len(settings) + len(lines)))
+    axes = figure.subplots()
+    right = max(run.steps[-1] for _, _, runs in settings for run in runs)
+    unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
+    for label, color, runs in settings:
+        steps, mean, std = mean_curve(runs)
+        x, y, band = steps / unit, metric.scale * mean, metric.scale * std
+        spread = f"mean ± std of {len(runs)} seeds" if len(runs) > 1 else "1 seed"
+        if len(runs) > 1:
+            axes.fill_between(x, y - band, y + band, color=color, alpha=0.18, linewidth=0)
+        axes.plot(x, y, color=color, linewidth=2.0, label=f"{label} ({spread})")
+    for number, (label, value) in enumerate(lines):
+        line_color = PAPER_COLOR if label.startswith("paper") else INK
+        dashes = _PAPER_DASHES[number // 2 % len(_PAPER_DASHES)]
+        name = f"{label}: {metric.text(value)}{metric.unit}"
+        axes.axhline(
+            metric.scale * value, color=line_color, linestyle=dashes, linewidth=1.2, label=name
+        )
+    axes.set_xlim(0.0, right / unit)
+    axes.set_ylim(0.0, 100.0 if metric.unit == "%" else None)
+    axes.set_xlabel(f"Environment steps on the new actions ({unit_name})", fontsize=9, color=INK)
+    axes.set_ylabel(f"{metric.name}, training episodes", fontsize=9, color=INK)
+    tidy(axes)
+    figure.legend(loc="outside lower center", ncols=2, **LEGEND)
+    set_title(figure, title)
+    return figure

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from experiments._training import EVALUATION_SEED, Trainer
+from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
 from jaxnew.actions import ActionSplit
 from jaxnew.evaluation import summarize
 from jaxnew.ppo import TrainState
@@ -24,18 +27,23 @@ def evaluate_on(
     split: ActionSplit,
     *,
     num_episodes: int,
+    set_size: int | None = None,
     deterministic: bool = False,
     seed: int = EVALUATION_SEED,
 ) -> dict[str, Any]:
     """Episodes on sets drawn from `ids`: metrics with intervals over episodes.
 
     Args:
-      name: of the ids; those of a split may be played otherwise, see `Trainer.on_split`.
+      name: of the ids.
+      set_size: actions per set; None for as many as in training, which are all of them on the part
+        that a method with one fixed set was trained with (`Trainer.on_split`).
     """
     start = time.perf_counter()
     evaluator = trainer.evaluator
     pool = ActionPool.of(ids, capacity=len(trainer.table), always_available=split.always_available)
-    if name in trainer.pools:
+    if set_size is not None:
+        evaluator = replace(evaluator, set_size=set_size, padded_set_size=0)
+    elif name in trainer.pools:
         evaluator, pool = trainer.on_split(name, evaluator)
     episodes = evaluator.run(
         state.params,
@@ -63,3 +71,24 @@ def record(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, An
         f"{name}-{kind}-{row['policy']}-m{row['set_size']}",
         {"checkpoint": kind, "step": step, "actions": name, **row},
     )
+
+
+def evaluate_run(path: Path, set_sizes: Mapping[str, int | None], num_episodes: int) -> None:
+    """Evaluates the best checkpoint of a run on parts of its split, and keeps the results.
+
+    Args:
+      set_sizes: by part, actions per set; None for as many as in training.
+    """
+    run, trainer, split = load_trainer(path)
+    state, step = load_state(run, trainer, "best")
+    for name, set_size in set_sizes.items():
+        row = evaluate_on(
+            trainer,
+            state,
+            name,
+            split.ids(name),
+            split,
+            num_episodes=num_episodes,
+            set_size=set_size,
+        )
+        record(run, name, "best", step, row)

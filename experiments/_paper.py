@@ -30,6 +30,7 @@ _METHODS = {
     ("ours", "vae"): "vae",
     ("ours", "vae-xy"): "vae",
     ("ours", "product"): "ours",
+    ("ours", "product-mu"): "ours",
     ("ours", "hvae-oracle"): "ours_oracle_hvae",
 }
 # Baselines and ablations of the policy, on the default representation of a domain.
@@ -39,7 +40,12 @@ _BASELINES = {
     "continuous": "continuous_output",
     "nearest-neighbour": "nearest_neighbor",
 }
-_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "product")
+_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "product", "product-mu")
+
+# Where a representation makes the paper's results those of an environment of its own.
+_ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"}
+# Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
+_SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
 
 class PaperError(ValueError):
@@ -93,6 +99,22 @@ def paper_method(method: str, representation: str) -> str | None:
     if method in _BASELINES and representation in _DEFAULT_REPRESENTATIONS:
         return _BASELINES[method]
     return _METHODS.get((method, representation))
+
+
+def paper_environment(environment: str | None, representation: str) -> str | None:
+    """Where the paper reports on a domain with a representation; None if it does not.
+
+    Args:
+      environment: the paper's name of the domain, or None.
+      representation: ours, such as `product-mu`.
+    """
+    found = _ENVIRONMENTS.get((str(environment), representation), environment)
+    return found if found in paper_environments() else None
+
+
+def paper_set_size(environment: str | None, split: str, trained: int) -> int:
+    """Actions in the sets of a bar of the paper, for a policy trained with sets of `trained`."""
+    return _SET_SIZES.get((str(environment), split), trained)
 
 
 def paper_environments() -> list[str]:

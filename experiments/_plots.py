@@ -201,42 +201,57 @@ def _draw_bar(
     )
 
 
-def tsne_scatter(
-    points: np.ndarray,
-    labels: np.ndarray,
-    class_names: Sequence[str],
-    title: str = "",
-    subtitle: str = "",
-) -> Figure:
+@dataclass(frozen=True)
+class Scatter:
+    """Two-dimensional representations.
+
+    Attributes:
+      points: f[n, 2].
+      labels: int[n] index into the names of the classes.
+      subtitle: above it.
+    """
+
+    points: np.ndarray
+    labels: np.ndarray
+    subtitle: str = ""
+
+
+def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: str = "") -> Figure:
     """Two-dimensional representations, coloured by class (spec method 11).
 
     Args:
-      points: f[n, 2].
-      labels: int[n] index into `class_names`.
+      panels: from left to right.
       class_names: legend, in label order; classes without a point are left out.
       title: of the figure.
-      subtitle: below it.
     """
-    figure = new_figure(4.6, 4.8)
-    axes = figure.subplots()
+    figure = new_figure(4.6 * len(panels), 4.8)
     colors = hls_palette(len(class_names))
-    for label, name in enumerate(class_names):
-        of_class = points[labels == label]
-        if len(of_class):
-            axes.scatter(
-                of_class[:, 0],
-                of_class[:, 1],
-                s=22,
-                color=colors[label],
-                edgecolor="white",
-                linewidth=0.4,
-                label=name,
-            )
-    axes.set_axis_off()
-    num_columns = min(4, len(class_names))
+    shown: dict[str, Any] = {}
+    for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
+        for label, name in enumerate(class_names):
+            of_class = panel.points[panel.labels == label]
+            if len(of_class):
+                shown[name] = axes.scatter(
+                    of_class[:, 0],
+                    of_class[:, 1],
+                    s=22,
+                    color=colors[label],
+                    edgecolor="white",
+                    linewidth=0.4,
+                    label=name,
+                )
+        axes.set_axis_off()
+        axes.set_title(panel.subtitle, fontsize=9, color=FAINT_INK)
+    names = [name for name in class_names if name in shown]
     narrow: dict[str, Any] = {"handletextpad": 0.1, "columnspacing": 1.0, "markerscale": 1.4}
-    figure.legend(loc="outside lower center", ncols=num_columns, **narrow, **LEGEND)
-    axes.set_title(subtitle, fontsize=9, color=FAINT_INK)
+    figure.legend(
+        [shown[name] for name in names],
+        names,
+        loc="outside lower center",
+        ncols=min(4 * len(panels), len(class_names)),
+        **narrow,
+        **LEGEND,
+    )
     set_title(figure, title)
     return figure
 

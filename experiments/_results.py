@@ -26,6 +26,8 @@ class ResultRow:
       task, method, representation: of the runs.
       actions: what the sets were drawn from: train, validation, test, ...
       checkpoint, policy, set_size: what was evaluated, and on how many actions.
+      is_standard: evaluated as the paper does: sampled actions of the checkpoint that was chosen by
+        validation, on sets of the paper's size.
       metric: the episode metric.
       mean: ours; over seeds if there are several.
       low, high: ends of its error bar.
@@ -47,6 +49,7 @@ class ResultRow:
     checkpoint: str
     policy: str
     set_size: int
+    is_standard: bool
     metric: str
     mean: float
     low: float
@@ -63,11 +66,6 @@ class ResultRow:
     paper_steps: float | None
     difference: float | None
     runs: tuple[str, ...]
-
-    @property
-    def is_standard(self) -> bool:
-        """Evaluated as the paper does: sampled actions of the checkpoint chosen by validation."""
-        return self.checkpoint == "best" and self.policy == "sampled"
 
 
 def result_rows(group: Group) -> list[ResultRow]:
@@ -113,6 +111,7 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
         checkpoint=first["checkpoint"],
         policy=first["policy"],
         set_size=first["set_size"],
+        is_standard=is_standard(group, first),
         metric=group.task.selection_metric,
         mean=mean,
         low=low,
@@ -128,22 +127,27 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
         paper_mean=paper.mean if paper else None,
         paper_std=paper.std if paper else None,
         paper_num_seeds=paper.num_seeds if paper else None,
-        paper_steps=paper_steps(str(group.task.paper_environment)) if paper else None,
+        paper_steps=paper_steps(str(group.paper_environment)) if paper else None,
         difference=scale * (mean - paper.mean) if paper else None,
         runs=tuple(str(run.path) for run in runs),
     )
 
 
+def is_standard(group: Group, evaluation: dict[str, Any]) -> bool:
+    """Whether an evaluation of a run of the group was made as the paper's."""
+    wanted = group.set_size(evaluation["actions"])
+    is_whole = evaluation["set_size"] == evaluation.get("num_actions")
+    return (evaluation["checkpoint"], evaluation["policy"]) == ("best", "sampled") and (
+        is_whole if wanted is None else evaluation["set_size"] == wanted
+    )
+
+
 def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
     """The paper's number for an evaluation that was made as the paper's."""
-    is_comparable = (
-        evaluation["actions"] in ("train", "test")
-        and (evaluation["checkpoint"], evaluation["policy"]) == ("best", "sampled")
-        and evaluation["set_size"] == group.config["ppo"]["rollout"]["set_size"]
-    )
-    if not is_comparable or group.paper_method is None:
+    is_bar = evaluation["actions"] in ("train", "test") and is_standard(group, evaluation)
+    if not is_bar or group.paper_method is None:
         return None
-    environment = str(group.task.paper_environment)
+    environment = str(group.paper_environment)
     return paper_value(environment, group.paper_method, evaluation["actions"])
 
 

@@ -14,7 +14,12 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE
 from experiments._flags import UsageError, load_task
-from experiments._paper import paper_environments, paper_method, paper_results
+from experiments._paper import (
+    paper_environment,
+    paper_method,
+    paper_results,
+    paper_set_size,
+)
 from experiments._plots import Metric
 from jaxnew.actions import ActionSplit
 from jaxnew.config import differences
@@ -108,24 +113,42 @@ class Group:
         return self.runs[0].config
 
     @property
+    def representation(self) -> str:
+        """Of all its runs."""
+        return self.runs[0].representation
+
+    @property
+    def paper_environment(self) -> str | None:
+        """Where the paper reports on this task and representation; None if it does not."""
+        return paper_environment(self.task.paper_environment, self.representation)
+
+    @property
     def paper_method(self) -> str | None:
         """What the paper calls this setting; None where it has no counterpart."""
-        is_in_paper = self.task.paper_environment in paper_environments()
-        if not is_in_paper or self.config["split"] != self.task.default_split:
+        is_default = self.config["split"] == self.task.default_split
+        if self.paper_environment is None or not is_default or self.is_finetuned:
             return None
-        return paper_method(self.config["method"], self.runs[0].representation)
+        return paper_method(self.config["method"], self.representation)
+
+    @property
+    def is_finetuned(self) -> bool:
+        """Trained with other actions than those of the train split."""
+        return bool(self.config["trained_on"] != "train")
 
     @property
     def metric(self) -> Metric:
         """How the task's selection metric is shown."""
-        return metric_of(self.task)
+        if self.paper_environment is None:
+            return Metric.of(self.task.selection_metric)
+        published = paper_results(self.paper_environment)[0].metric
+        return Metric.of(self.task.selection_metric, published)
 
-
-def metric_of(task: Task) -> Metric:
-    """How the selection metric of a task is shown."""
-    if task.paper_environment not in paper_environments():
-        return Metric.of(task.selection_metric)
-    return Metric.of(task.selection_metric, paper_results(task.paper_environment)[0].metric)
+    def set_size(self, actions: str) -> int | None:
+        """Actions in the sets of a standard evaluation; None for all that training had at once."""
+        rollout = self.config["ppo"]["rollout"]
+        if rollout["has_fixed_set"] and actions == self.config["trained_on"]:
+            return None
+        return paper_set_size(self.paper_environment, actions, int(rollout["set_size"]))
 
 
 def read_runs(paths: Sequence[Path]) -> list[Run]:

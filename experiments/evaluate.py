@@ -41,11 +41,6 @@ def main() -> None:
     path, kind = locate(Path(RUN.value))
     kind = kind or CHECKPOINT.value
     run, trainer, split = load_trainer(path)
-    if SET_SIZE.value is not None:
-        evaluator = dataclasses.replace(
-            trainer.evaluator, set_size=SET_SIZE.value, padded_set_size=0
-        )
-        trainer = dataclasses.replace(trainer, evaluator=evaluator)
     if TABLE.value is not None:
         new = RepresentationTable.load(Path(TABLE.value))
         trainer = dataclasses.replace(trainer, table=with_new_rows(trainer.table, new))
@@ -59,6 +54,7 @@ def main() -> None:
             ids,
             split,
             num_episodes=EPISODES.value,
+            set_size=SET_SIZE.value,
             deterministic=DETERMINISTIC.value,
             seed=EVALUATION_KEY.value,
         )

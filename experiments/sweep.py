@@ -43,6 +43,9 @@ from jaxnew.sampling import ActionPool
 
 SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71"], "Seeds of the members.")
 VARY = flags.DEFINE_multi_string("vary", [], "hyperparameter=value,value,... (repeatable).")
+REPRESENTATION_BUDGET = flags.DEFINE_string(
+    "representation_budget", None, "Budget of a representation to be trained; default: --budget."
+)
 AT_ONCE = flags.DEFINE_integer(
     "members_at_once", 0, "Members that a device vmaps; 0: all, or 1 on CPUs.", lower_bound=0
 )
@@ -235,7 +238,7 @@ def main() -> None:
     runs = Path(flag.RUNS.value)
     budget = flag.budget_of(task.stage_two, flag.BUDGET.value, "Stage two")
     name = flag.REPRESENTATION.value
-    table = find_table(domain, runs, name, flag.BUDGET.value)
+    table = find_table(domain, runs, name, REPRESENTATION_BUDGET.value or flag.BUDGET.value)
     base = config_lib.set_paths(
         TrainConfig.of(domain, flag.METHOD.value, name, table, budget, flag.SEED.value),
         flag.SET.value,
@@ -243,7 +246,9 @@ def main() -> None:
     configs = member_configs(base, parse_seeds(SEEDS.value), VARY.value)
     trainer = Trainer.of(configs[0], task, domain.split, table)
     sweep = Sweep.of(trainer, configs, jax.devices(), AT_ONCE.value)
-    path = Path(flag.WORKDIR.value or domain.folder(runs) / f"sweep-{base.method}-{name}")
+    path = Path(
+        flag.WORKDIR.value or domain.folder(runs) / f"sweep-{base.method}-{Path(name).stem}"
+    )
     plain = {"members": [config_lib.to_dict(config) for config in configs]}
     with RunDirectory.open_or_create(path, plain, flag.OVERWRITE.value) as run:
         print(

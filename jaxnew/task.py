@@ -109,6 +109,19 @@ class Baselines:
 
 
 @dataclass(frozen=True)
+class Measured:
+    """Speeds on one core of the machine that `README.md` names; for foretelling durations.
+
+    Attributes:
+      training: environment steps per second by method; one that is absent is taken as `ours`.
+      evaluation: episodes per second.
+    """
+
+    training: Mapping[str, float]
+    evaluation: float
+
+
+@dataclass(frozen=True)
 class Task:
     """A domain. Modules in `experiments/tasks/` define one called `TASK`.
 
@@ -122,6 +135,7 @@ class Task:
       stage_one, stage_two: presets by budget.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
       baselines: settings of the paper's baselines.
+      measured: speeds, or None where nobody measured them.
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
@@ -137,6 +151,7 @@ class Task:
     split_seed: int = 0
     selection_metric: str = "is_success"
     baselines: Baselines = field(default_factory=Baselines)
+    measured: Measured | None = None
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
 

@@ -66,6 +66,15 @@ TASK = Task(
             final_episodes=5000,
             cost="hours",
         ),
+        # Fully observable: twice the steps (spec method 6).
+        "paper-mu": StageTwoBudget(
+            num_updates=9765,
+            ppo=replace(_PPO, lr_steps=80_000_000),
+            hyperparameters=_HYPERPARAMETERS,
+            loop=_LOOP,
+            final_episodes=5000,
+            cost="hours",
+        ),
     },
     selection_metric="click_through_rate",
     baselines=Baselines(fixed_set=_fixed_set),

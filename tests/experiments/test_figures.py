@@ -18,7 +18,7 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from envs_mjx.grid_world import skill_universe
-from experiments import _episode, figures
+from experiments import _drawing, _episode, figures
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE
 from experiments._curves import CurveSetting, RunCurve, learning_curves, mean_curve
 from experiments._episode import Episode, choose, episode_animation, play_episodes
@@ -404,7 +404,7 @@ def test_colours_are_the_papers_and_never_shared(tmp_path: Path) -> None:
         plain_config(representation="gt12"),
     ]
     paths = [write_run(tmp_path / f"{i}", config) for i, config in enumerate(configs)]
-    colors = figures.setting_colors(groups_at(*paths))
+    colors = _drawing.setting_colors(groups_at(*paths))
     assert colors[0] == hls_palette(10)[3]
     assert colors[3] == hls_palette(10)[4]
     assert len(set(colors)) == 4
@@ -413,7 +413,7 @@ def test_colours_are_the_papers_and_never_shared(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_learning_curve_of_a_run_in_environment_steps(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run", plain_config(representation="hvae"))
-    figure = figures.curves_figure(groups_at(path))
+    figure = _drawing.curves_figure(groups_at(path))
     assert figure is not None
     raw, held = (line for line in figure.axes[1].lines if line.get_label().startswith("ours,"))
     # Evaluated after 2, 4 and 6 updates of 256 steps; below a million the axis is in thousands.
@@ -424,11 +424,11 @@ def test_learning_curve_of_a_run_in_environment_steps(tmp_path: Path) -> None:
     assert labels[-1] == "paper, ours, held at best (mean ± std over seeds)"
     # The paper has no curve for engineered vectors: its default stands in, under its own name.
     engineered = write_run(tmp_path / "gt12", plain_config())
-    figure = figures.curves_figure(groups_at(engineered))
+    figure = _drawing.curves_figure(groups_at(engineered))
     assert figure is not None
     assert legend_texts(figure)[-1].startswith("paper, ours on HVAE (none for gt12), held")
     untrained = write_run(tmp_path / "none", plain_config(seed=5), curve=())
-    assert figures.curves_figure(groups_at(untrained)) is None
+    assert _drawing.curves_figure(groups_at(untrained)) is None
 
 
 @pytest.mark.unit
@@ -441,7 +441,7 @@ def test_bars_of_runs_beside_the_papers(tmp_path: Path) -> None:
         write_evaluation(path, "test", mean)
     groups = groups_at(*paths)
     rows = {group.label: result_rows(group) for group in groups}
-    figure = figures.bars_figure(groups, rows)
+    figure = _drawing.bars_figure(groups, rows)
     assert figure is not None
     axes = figure.axes[0]
     # Two seeds, the paper's `ours`, and a setting that the paper does not have.
@@ -459,7 +459,7 @@ def test_bars_of_runs_beside_the_papers(tmp_path: Path) -> None:
         "ours, 95 % interval over episodes (1,000 episodes a bar);",
         "paper, population std over seeds.",
     ]
-    assert figures.bars_figure(groups, {label: [] for label in rows}) is None
+    assert _drawing.bars_figure(groups, {label: [] for label in rows}) is None
 
 
 @pytest.mark.unit
@@ -472,7 +472,7 @@ def test_tsne_draws_the_actions_of_one_part(
         seen.append(vectors)
         return vectors[:, :2]
 
-    monkeypatch.setattr(figures.report, "tsne", first_two)
+    monkeypatch.setattr(_drawing.report, "tsne", first_two)
     ids = np.arange(1024, dtype=np.int32)
     # The vector says which action it is; quadrants lie apart, so that every neighbour is a friend.
     labels = skill_universe().class_labels
@@ -483,7 +483,7 @@ def test_tsne_draws_the_actions_of_one_part(
     held_out = np.sort(np.concatenate([split.validation, split.test]))
     parts = {"heldout": held_out, "train": split.train, "all": ids}
     for part, members in parts.items():
-        figure = figures.tsne_figure(run, part)
+        figure = _drawing.tsne_figure(run, part)
         assert figure is not None
         drawn = (seen[-1][:, 0] % 1e4).astype(int)
         assert len(drawn) == 400
@@ -495,7 +495,7 @@ def test_tsne_draws_the_actions_of_one_part(
             x = np.asarray(points.get_offsets())[:, 0]
             assert x.tolist() == seen[-1][labels[drawn] == label, 0].tolist()
     assert legend_texts(figure) == list(skill_universe().class_names)
-    figures.tsne_figure(run, "all")
+    _drawing.tsne_figure(run, "all")
     assert np.array_equal(seen[-1], seen[-2])  # The seed of the run chooses.
 
 
@@ -506,7 +506,7 @@ def test_tsne_draws_the_actions_of_one_part(
 def test_figures_of_run_directories(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(figures.report, "tsne", lambda vectors, seed: vectors[:, :2])
+    monkeypatch.setattr(_drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
     paths = [write_run(tmp_path / f"run {seed}", plain_config(seed=seed)) for seed in (1, 2)]
     write_evaluation(paths[0], "train", 0.9)
     write_evaluation(paths[1], "train", 0.8)
@@ -532,7 +532,7 @@ def test_figures_of_run_directories(
 def test_nothing_evaluated_leaves_out_the_bars_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(figures.report, "tsne", lambda vectors, seed: vectors[:, :2])
+    monkeypatch.setattr(_drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
     run = write_run(tmp_path / "run", plain_config(), curve=())
     files = figures.make_figures([run], run / "figures")
     assert [file.name for file in files][:2] == ["results.md", "results.csv"]
@@ -546,7 +546,7 @@ def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
     config = {"task": "grid_world", "representation": "gt12", "seed": 3, "model": {}}
     run = write_run(tmp_path / "embed", config)
     files = commands.run("figures", f"--run={run}").split()
-    assert files == [str(run / "figures" / f"tsne_{part}.png") for part in figures.TSNE_PARTS]
+    assert files == [str(run / "figures" / f"tsne_{part}.png") for part in _drawing.TSNE_PARTS]
     assert all(Image.open(file).size == (920, 960) for file in files)
 
 
