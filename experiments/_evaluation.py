@@ -28,6 +28,8 @@ def evaluate_on(
     *,
     num_episodes: int,
     set_size: int | None = None,
+    first_size: int = 0,
+    growth: int = 1,
     deterministic: bool = False,
     seed: int = EVALUATION_SEED,
 ) -> dict[str, Any]:
@@ -37,6 +39,7 @@ def evaluate_on(
       name: of the ids.
       set_size: actions per set; None for as many as in training, which are all of them on the part
         that a method with one fixed set was trained with (`Trainer.on_split`).
+      first_size, growth: of a set that grows during the episode, see `Evaluator`.
     """
     start = time.perf_counter()
     evaluator = trainer.evaluator
@@ -45,6 +48,8 @@ def evaluate_on(
         evaluator = replace(evaluator, set_size=set_size, padded_set_size=0)
     elif name in trainer.pools:
         evaluator, pool = trainer.on_split(name, evaluator)
+    if first_size:
+        evaluator = replace(evaluator, first_size=first_size, growth=growth)
     episodes = evaluator.run(
         state.params,
         state.rollout.observation_statistics,
@@ -59,6 +64,7 @@ def evaluate_on(
         "num_episodes": num_episodes,
         "num_actions": int(pool.size),
         "set_size": evaluator.set_size,
+        **({"first_size": first_size, "growth": growth} if first_size else {}),
         "policy": "greedy" if deterministic else "sampled",
         "evaluation_seed": seed,
         "seconds": round(time.perf_counter() - start, 2),
@@ -67,10 +73,15 @@ def evaluate_on(
 
 def record(run: RunDirectory, name: str, kind: str, step: int, row: dict[str, Any]) -> None:
     """Keeps one result in the run directory."""
-    run.record_evaluation(
-        f"{name}-{kind}-{row['policy']}-m{row['set_size']}",
-        {"checkpoint": kind, "step": step, "actions": name, **row},
-    )
+    content = {"checkpoint": kind, "step": step, "actions": name, **row}
+    run.record_evaluation(file_stem(content), content)
+
+
+def file_stem(content: dict[str, Any]) -> str:
+    """What a result is called: results that were made differently have files of their own."""
+    grown = f"-from{content['first_size']}-by{content['growth']}" if "first_size" in content else ""
+    stem = "{actions}-{checkpoint}-{policy}-m{set_size}".format(**content)
+    return f"{stem}{grown}"
 
 
 def evaluate_run(path: Path, set_sizes: Mapping[str, int | None], num_episodes: int) -> None:

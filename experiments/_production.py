@@ -63,10 +63,11 @@ class Source:
         task = self.domain.task
         budget = budget_of(task.stage_two, self.budget, "Stage two")
         budget = adapted(budget, method, task, self.domain.split)
+        budget = config_lib.set_paths(budget, list(self.assignments))
         if self.steps:
             updates = math.ceil(self.steps / budget.ppo.steps_per_update)
             budget = replace(budget, num_updates=updates)
-        return config_lib.set_paths(budget, list(self.assignments))
+        return budget
 
     def table_of(self, representation: str) -> RepresentationTable | None:
         """The table that was given for a representation; None if none was."""
@@ -123,6 +124,8 @@ def policies(folder: Path) -> list[Run]:
     """Every readable policy run below a folder; members of sweeps are runs."""
     runs = []
     for file in sorted(folder.rglob("config.json")):
+        if "members.partial" in file.parts:  # Of a sweep that is being written.
+            continue
         with suppress(UsageError, RunDirectoryError):
             runs += [run for run in read_runs([file.parent]) if run.path == file.parent.resolve()]
     return [run for run in runs if run.is_policy and run.table is not None]
@@ -152,23 +155,28 @@ class Job:
     seconds: float | None
 
     def run(self) -> None:
-        """Runs the command in a process of its own, which signals reach too.
+        """Runs the command in a process of its own, and lets it save and end on a signal.
 
         Raises:
-          UsageError: the command failed.
+          UsageError: the command failed, or was stopped.
         """
         print(f"{self.title} ({self.cost}): {self.text}", flush=True)
         process = subprocess.Popen([sys.executable, "-m", *self._module, *self.command[1:]])
-        previous = signal.signal(signal.SIGTERM, lambda *_: process.terminate())
+        received: list[int] = []
+
+        def stop(number: int, frame: Any) -> None:
+            received.append(number)
+            if number == signal.SIGTERM:  # Ctrl-C reaches the process by itself.
+                process.terminate()
+
+        previous = {which: signal.signal(which, stop) for which in (signal.SIGINT, signal.SIGTERM)}
         try:
-            while True:
-                try:
-                    status = process.wait()
-                    break
-                except KeyboardInterrupt:  # The child got it as well; it saves and ends.
-                    continue
+            status = process.wait()
         finally:
-            signal.signal(signal.SIGTERM, previous)
+            for which, handler in previous.items():
+                signal.signal(which, handler)
+        if received:
+            raise UsageError("Stopped; call the same command again to go on.")
         if status:
             raise UsageError(f"The command ended with status {status}: {self.text}")
 
@@ -219,8 +227,8 @@ def sweep_job(source: Source, cell: Cell, seeds: Sequence[int]) -> Job:
         f"--seeds={listed}",
         f"--runs={source.folder}",
         f"--workdir={folder}",
-        f"--set=num_updates={budget.num_updates}",
         *(f"--set={assignment}" for assignment in source.assignments),
+        f"--set=num_updates={budget.num_updates}",
     )
     steps = budget.num_updates * budget.ppo.steps_per_update
     seconds = training_seconds(source, cell.method, steps * len(seeds), len(seeds))

@@ -70,11 +70,12 @@ class ResultRow:
 
 def result_rows(group: Group) -> list[ResultRow]:
     """Every evaluation of the group's runs, over the seeds that have it."""
-    found: dict[tuple[str, str, str, int], list[tuple[Run, dict[str, Any]]]] = {}
+    found: dict[tuple[Any, ...], list[tuple[Run, dict[str, Any]]]] = {}
     for run in group.runs:
         for e in run.evaluations:
             if group.task.selection_metric in e["metrics"]:
-                key = e["actions"], e["checkpoint"], e["policy"], e["set_size"]
+                grows = e.get("first_size", 0), e.get("growth", 0)
+                key = e["actions"], e["checkpoint"], e["policy"], e["set_size"], *grows
                 found.setdefault(key, []).append((run, e))
     order = ("train", "validation", "test")
     rows = [_result_row(group, evaluations) for evaluations in found.values()]
@@ -135,6 +136,8 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
 
 def is_standard(group: Group, evaluation: dict[str, Any]) -> bool:
     """Whether an evaluation of a run of the group was made as the paper's."""
+    if "first_size" in evaluation:
+        return False
     wanted = group.set_size(evaluation["actions"])
     is_whole = evaluation["set_size"] == evaluation.get("num_actions")
     return (evaluation["checkpoint"], evaluation["policy"]) == ("best", "sampled") and (

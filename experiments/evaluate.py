@@ -29,6 +29,10 @@ SETS = flags.DEFINE_list("sets", ["test"], "Parts of the split: train, validatio
 EPISODES = flags.DEFINE_integer("episodes", 5000, "Episodes per set.")
 DETERMINISTIC = flags.DEFINE_bool("deterministic", False, "Take the most likely action.")
 SET_SIZE = flags.DEFINE_integer("set_size", None, "Actions per set; default: as in training.")
+GROWS_FROM = flags.DEFINE_integer(
+    "grows_from", 0, "Actions of a set at the first step; the set grows during the episode."
+)
+GROWTH = flags.DEFINE_integer("growth", 1, "Actions that a growing set gains at every step.")
 IDS = flags.DEFINE_string("ids", None, "File of action ids to draw sets from.")
 TABLE = flags.DEFINE_string("table", None, ".npz table whose actions are drawn and represented.")
 UNSEEN_RATIO = flags.DEFINE_float("unseen_ratio", None, "Share of test actions among train ones.")
@@ -55,6 +59,8 @@ def main() -> None:
             split,
             num_episodes=EPISODES.value,
             set_size=SET_SIZE.value,
+            first_size=GROWS_FROM.value,
+            growth=GROWTH.value,
             deterministic=DETERMINISTIC.value,
             seed=EVALUATION_KEY.value,
         )

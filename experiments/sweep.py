@@ -320,12 +320,16 @@ def member_configs(base: TrainConfig, seeds: list[int], vary: list[str]) -> list
 def write_members(
     run: RunDirectory, sweep: Sweep, state: SweepState, domain: Domain, table: RepresentationTable
 ) -> None:
-    """Writes one run directory per member, and prints how each did."""
+    """Writes one run directory per member, and prints how each did.
+
+    All appear at once, when all are whole; members that are there are left alone.
+    """
     lines = read(run.path / "metrics.jsonl")
+    partial, members = run.path / "members.partial", run.path / "members"
     num_updates = sweep.trainer.config.num_updates
     summary = []
     for index, config in enumerate(sweep.configs):
-        path = run.path / "members" / f"{index:03d}"
+        path = members / f"{index:03d}"
         best, latest = (
             jax.tree.map(lambda x, i=index: x[i], tree) for tree in (state.best, state.members)
         )
@@ -336,16 +340,20 @@ def write_members(
             "best_step": int(best.step) if has_best else None,
             "elapsed_s": lines[-1].get("time/elapsed_s", 0.0),
         }
-        with RunDirectory.open_or_create(path, config_lib.to_dict(config), True) as member:
-            save_inputs(member, domain.split, table)
-            write_metrics(member, lines, f"{index:03d}/")
-            checkpointer = Checkpointer(member.checkpoints)
-            if has_best:
-                checkpointer.save("best", int(best.step), best, metadata)
-            checkpointer.save("latest", num_updates, latest, metadata)
+        if not members.exists():
+            plain = config_lib.to_dict(config)
+            with RunDirectory.open_or_create(partial / path.name, plain, True) as member:
+                save_inputs(member, domain.split, table)
+                write_metrics(member, lines, f"{index:03d}/")
+                checkpointer = Checkpointer(member.checkpoints)
+                if has_best:
+                    checkpointer.save("best", int(best.step), best, metadata)
+                checkpointer.save("latest", num_updates, latest, metadata)
         row = {"member": path.name, "seed": config.seed, **metadata}
         summary.append({**row, "hyperparameters": config_lib.to_dict(config.hyperparameters)})
         print(f"{path}: seed {config.seed}, {sweep.trainer.selection_metric} {best_metric:.4f}")
+    if not members.exists():
+        partial.rename(members)
     run.record_evaluation("members", {"members": summary})
     print(json.dumps(max(summary, key=lambda row: row["best_metric"] or -np.inf)))
 

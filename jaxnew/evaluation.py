@@ -18,7 +18,7 @@ from jaxnew.environment import Environment
 from jaxnew.metrics import mean_interval, wilson_interval
 from jaxnew.policy import PolicyMethod
 from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, check_set_size, draw_sets
+from jaxnew.sampling import ActionPool, AvailableSet, check_set_size, draw_sets
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,8 @@ class Evaluator:
       set_size: m, actions available in an episode.
       padded_set_size: width of the sets, 0 for `set_size`.
       normalize_observations: whether the policy was trained on normalised observations.
+      first_size: actions of the set that are available at the first step, 0 for all of them; then
+        `growth` more become available at every step.
       width: episodes played at a time.
     """
 
@@ -40,7 +42,16 @@ class Evaluator:
     set_size: int
     padded_set_size: int = 0
     normalize_observations: bool = True
+    first_size: int = 0
+    growth: int = 1
     width: int = 128
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.first_size <= self.set_size or self.growth < 0:
+            raise ValueError(
+                f"first_size={self.first_size} must be in 0..{self.set_size} (the set size) and "
+                f"growth={self.growth} at least 0."
+            )
 
     def run(
         self,
@@ -105,7 +116,8 @@ class Evaluator:
             obs, state, is_over, metrics = carry
             if self.normalize_observations:
                 obs = statistics.normalize(obs)
-            distribution = self.method.distribution(params, obs, projected, available.mask)
+            now = self._available_at(available, t)
+            distribution = self.method.distribution(params, obs, projected, now.mask)
             keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys_steps)
             if deterministic:
                 sample = distribution.mode()
@@ -113,7 +125,7 @@ class Evaluator:
                 sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
             obs, state, _, terminated, truncated, info = jax.vmap(
                 self.env.step_env, in_axes=(0, 0, 0, None)
-            )(keys_now[:, 1], state, self.method.decode(sample, available, table), self.env_params)
+            )(keys_now[:, 1], state, self.method.decode(sample, now, table), self.env_params)
             metrics = {
                 name: jnp.where(is_over, old, self._metric(name, info, t))
                 for name, old in metrics.items()
@@ -126,6 +138,13 @@ class Evaluator:
         num_steps = self.env.max_episode_steps(self.env_params)
         (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(num_steps))
         return metrics
+
+    def _available_at(self, available: AvailableSet, t: jax.Array) -> AvailableSet:
+        """What may be chosen at step `t`: sets are in random order, so a beginning is a set too."""
+        if self.first_size == 0:
+            return available
+        is_there = jnp.arange(available.ids.shape[-1]) < self.first_size + self.growth * t
+        return AvailableSet(available.ids, available.mask & is_there)
 
     @staticmethod
     def _metric(name: str, info: dict[str, jax.Array], t: jax.Array) -> jax.Array:

@@ -19,101 +19,40 @@ from PIL import Image
 
 from envs_mjx.grid_world import skill_universe
 from experiments import _drawing, _episode, figures
-from experiments._artifacts import SPLIT_FILE, TABLE_FILE
 from experiments._curves import CurveSetting, RunCurve, learning_curves, mean_curve
 from experiments._episode import Episode, choose, episode_animation, play_episodes
-from experiments._flags import UsageError, budget_of
+from experiments._flags import UsageError
 from experiments._paper import PaperCurve, paper_value
-from experiments._plots import Bar, BarSetting, Metric, bars, hls_palette, save, tsne_scatter
+from experiments._plots import (
+    Bar,
+    BarSetting,
+    Metric,
+    Scatter,
+    bars,
+    hls_palette,
+    save,
+    tsne_scatter,
+)
 from experiments._results import as_markdown, result_rows
-from experiments._runs import Group, group_runs, read_runs
+from experiments._runs import read_runs
 from experiments._training import TrainConfig, Trainer
 from experiments.tasks.grid_world import TASK
 from jaxnew import config as config_lib
-from jaxnew.actions import ActionSplit
 from jaxnew.checkpoint import Checkpointer
-from jaxnew.metrics import MetricsLog
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable, engineered_table
 from jaxnew.run_directory import RunDirectory
 from tests.experiments import commands
+from tests.experiments.handwritten import (
+    a_split,
+    groups_at,
+    plain_config,
+    write_evaluation,
+    write_run,
+)
 
 RED = (1.0, 0.0, 0.0)
 SUCCESS = Metric.of("is_success")
-
-
-# ---- Hand-written run directories ----
-
-
-def plain_config(
-    seed: int = 1,
-    representation: str = "gt12",
-    split: str = "default",
-    learning_rate: float = 0.001,
-) -> dict[str, Any]:
-    budget = budget_of(TASK.stage_two, "smoke", "Stage two")
-    return {
-        "task": "grid_world",
-        "method": "ours",
-        "representation": representation,
-        "table_hash": "t",
-        "split": split,
-        "split_hash": "s",
-        "seed": seed,
-        "num_updates": 4,
-        "ppo": config_lib.to_dict(budget.ppo),
-        "hyperparameters": {
-            **config_lib.to_dict(budget.hyperparameters),
-            "learning_rate": learning_rate,
-        },
-        "loop": config_lib.to_dict(budget.loop),
-        "trained_on": "train",
-        "start": "fresh parameters",
-    }
-
-
-def a_split() -> ActionSplit:
-    return TASK.make_split("default", skill_universe())
-
-
-def write_run(
-    path: Path,
-    config: dict[str, Any],
-    curve: tuple[float, ...] = (0.1, 0.3, 0.2),
-    table: RepresentationTable | None = None,
-) -> Path:
-    """A run of two updates per evaluation; validation is half of train."""
-    with RunDirectory.open_or_create(path, config):
-        table = table or engineered_table(skill_universe(), "gt12")
-        table.save(path / TABLE_FILE)
-        a_split().save(path / SPLIT_FILE)
-        with MetricsLog(path) as log:
-            for number, value in enumerate(curve):
-                step = 2 * (number + 1)
-                log.write(step, {"loss/total": 1.0})
-                log.write(step, {"train/is_success": value, "validation/is_success": value / 2})
-    return path
-
-
-def write_evaluation(path: Path, actions: str, mean: float, **changes: Any) -> None:
-    content = {
-        "checkpoint": "best",
-        "step": 4,
-        "actions": actions,
-        "metrics": {
-            "is_success": {"mean": mean, "low": mean - 0.02, "high": mean + 0.01, "interval": ""}
-        },
-        "num_episodes": 1000,
-        "set_size": 50,
-        "policy": "sampled",
-        **changes,
-    }
-    name = f"{actions}-{content['checkpoint']}-{content['policy']}-m{content['set_size']}"
-    RunDirectory.load(path).record_evaluation(name, content)
-
-
-def groups_at(*paths: Path) -> list[Group]:
-    return group_runs(read_runs(paths))
 
 
 def texts(figure: Any) -> str:
@@ -248,7 +187,7 @@ def test_a_metric_has_the_unit_and_limit_of_the_paper() -> None:
 @pytest.mark.unit
 def test_scatter_draws_each_class_in_its_colour(tmp_path: Path) -> None:
     points = np.array([[0.0, 1.0], [2.0, 3.0], [4.0, 5.0]])
-    figure = tsne_scatter(points, np.array([2, 0, 2]), ("a", "b", "c"), "title", "below")
+    figure = tsne_scatter([Scatter(points, np.array([2, 0, 2]), "below")], ("a", "b", "c"), "title")
     first, second = (c for c in figure.axes[0].collections if isinstance(c, PathCollection))
     assert first.get_offsets().tolist() == [[2.0, 3.0]]
     assert second.get_offsets().tolist() == [[0.0, 1.0], [4.0, 5.0]]
@@ -543,7 +482,13 @@ def test_nothing_evaluated_leaves_out_the_bars_and_says_so(
 
 @pytest.mark.integration
 def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
-    config = {"task": "grid_world", "representation": "gt12", "seed": 3, "model": {}}
+    config = {
+        "task": "grid_world",
+        "representation": "gt12",
+        "split": "default",
+        "seed": 3,
+        "model": {},
+    }
     run = write_run(tmp_path / "embed", config)
     files = commands.run("figures", f"--run={run}").split()
     assert files == [str(run / "figures" / f"tsne_{part}.png") for part in _drawing.TSNE_PARTS]
@@ -554,6 +499,7 @@ def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
 def test_command_asks_for_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def run(paths: list[Path], episode: bool = False, out: Path | None = None) -> None:
         values = {"run": list(map(str, paths)), "out": out, "pdf": False, "episode": episode}
+        values["figure"] = []
         monkeypatch.setattr(figures.flags, "FLAGS", SimpleNamespace(**values))
         figures.main()
 
