@@ -11,6 +11,7 @@ import numpy as np
 
 from experiments._flags import UsageError
 from jaxnew.actions import ActionSplit
+from jaxnew.environment import ActionSpec
 from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method
 from jaxnew.task import StageTwoBudget, Task
 
@@ -83,10 +84,25 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
     return replace(budget, ppo=replace(ppo, rollout=rollout), hyperparameters=hyperparameters)
 
 
-def method_of(name: str, task: Task, split: ActionSplit, part: str = "train") -> PolicyMethod:
-    """The policy behind a variant that is trained with a part of the split."""
+def method_of(
+    name: str,
+    task: Task,
+    split: ActionSplit,
+    part: str = "train",
+    *,
+    action_spec: ActionSpec | None = None,
+    conditions_position: bool = False,
+) -> PolicyMethod:
+    """The policy behind a variant that is trained with a part of the split.
+
+    Args:
+      action_spec: of the domain, for what comes with a choice there.
+      conditions_position: see `MethodContext`.
+    """
     context = MethodContext(
         train_ids=trained_ids(name, task, split, part),
         sums_gaussian_entropy=task.baselines.sums_gaussian_entropy,
+        action_spec=action_spec,
+        conditions_position=conditions_position,
     )
     return make_method(variant_of(name).policy, context)

@@ -100,6 +100,7 @@ def find(source: Source, cell: Cell) -> dict[int, Run]:
         is_wanted = (
             config["method"] == cell.method
             and config["trained_on"] == "train"
+            and not config.get("num_clusters", 0)
             and config["split_hash"] == source.domain.split.hash
             and run.representation == cell.representation
             and _plain(config) == wanted

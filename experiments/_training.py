@@ -20,6 +20,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.checkpoint import Checkpointer, Kind
 from jaxnew.evaluation import Evaluator
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
+from jaxnew.representation.clusters import balanced_clusters
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.run_directory import RunDirectory
@@ -37,6 +38,9 @@ class TrainConfig:
     Attributes:
       trained_on: part of the split whose actions it is trained with.
       start: what `finetune` begins with, or "fresh parameters".
+      num_clusters: training sets are drawn from half of so many clusters of the representations
+        (spec method 2.2); 0 for the paper's runs, which draw from all actions.
+      conditions_position: the position's head reads the chosen action (spec method 5.5).
     """
 
     task: str
@@ -52,6 +56,13 @@ class TrainConfig:
     loop: LoopConfig
     trained_on: str = "train"
     start: str = "fresh parameters"
+    num_clusters: int = 0
+    conditions_position: bool = False
+
+    @classmethod
+    def from_plain(cls, plain: dict[str, Any]) -> TrainConfig:
+        """The config of a run directory; fields that it is too old for are as they were then."""
+        return config_lib.from_dict(cls, {"num_clusters": 0, "conditions_position": False, **plain})
 
     @classmethod
     def of(
@@ -109,7 +120,14 @@ class Trainer:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
         env = task.make_environment()
-        method = method_of(config.method, task, split, config.trained_on)
+        method = method_of(
+            config.method,
+            task,
+            split,
+            config.trained_on,
+            action_spec=env.action_spec,
+            conditions_position=config.conditions_position,
+        )
         vectors = table.rows(np.arange(env.action_spec.num_actions))
         rollout_config = config.ppo.rollout
         pools = {
@@ -119,6 +137,14 @@ class Trainer:
             for name in ("train", "validation", "test")
         }
         training_pool = pools["train"]
+        if config.num_clusters:
+            ids = split.ids(config.trained_on)
+            training_pool = ActionPool.of(
+                ids,
+                capacity=len(vectors),
+                always_available=split.always_available,
+                groups=balanced_clusters(table.rows(ids), config.num_clusters),
+            )
         if rollout_config.has_fixed_set:
             fixed = trained_ids(config.method, task, split, config.trained_on)
             training_pool = ActionPool.of(
@@ -126,6 +152,8 @@ class Trainer:
             )
         watched_size = config.loop.evaluation_set_size or rollout_config.set_size
         check_set_size(pools["train"], rollout_config.set_size, "the train actions")
+        if not rollout_config.has_fixed_set:
+            check_set_size(training_pool, rollout_config.set_size, "the train actions")
         for name in SPLITS_WATCHED:
             check_set_size(pools[name], watched_size, f"the {name} actions")
         evaluator = Evaluator(
@@ -276,7 +304,7 @@ def load_trainer(path: Path) -> tuple[RunDirectory, Trainer, ActionSplit]:
       SplitMismatch: split or table were changed since.
     """
     run = RunDirectory.load(path)
-    config = config_lib.from_dict(TrainConfig, run.config)
+    config = TrainConfig.from_plain(run.config)
     task = load_task(config.task)
     split = ActionSplit.load(path / SPLIT_FILE)
     split.check(task.make_universe())

@@ -34,20 +34,33 @@ class ActionPool:
       ids: int32[P] pool members first, then padding (repeats of the first member).
       size: int32[] number of members.
       always_available: int32[q] ids that stand in the first q slots of every set.
+      group_starts: int32[G + 1] where each group of members begins and the last one ends, or None.
+        With groups, a set is drawn from half of them (rounded down, at least one), which are drawn
+        first (spec method 2.2, cluster sampling).
     """
 
     ids: jax.Array
     size: jax.Array
     always_available: jax.Array
+    group_starts: jax.Array | None = None
 
     @classmethod
     def of(
-        cls, ids: np.ndarray, *, capacity: int, always_available: np.ndarray | None = None
+        cls,
+        ids: np.ndarray,
+        *,
+        capacity: int,
+        always_available: np.ndarray | None = None,
+        groups: np.ndarray | None = None,
     ) -> ActionPool:
         """Builds a pool of `ids`, padded to `capacity` (usually the size of the universe).
 
+        Args:
+          groups: int[len(ids)] label of the group of each id, or None for no groups.
+
         Raises:
-          ValueError: no id, an id twice, more ids than `capacity`, or a capacity above 65,536.
+          ValueError: no id, an id twice, more ids than `capacity`, a capacity above 65,536, or not
+            one label per id.
         """
         if capacity > _MAX_POOL:
             raise ValueError(f"A pool holds at most {_MAX_POOL} actions, not {capacity}.")
@@ -57,9 +70,26 @@ class ActionPool:
             raise ValueError(f"A pool needs distinct ids and at least one, got {ids}.")
         if len(members) > capacity:
             raise ValueError(f"{len(members)} ids do not fit a pool of capacity {capacity}.")
+        starts = None
+        if groups is not None:
+            members, starts = _by_group(np.asarray(ids, np.int32), np.asarray(groups), members)
         padded = np.full(capacity, members[0], np.int32)
         padded[: len(members)] = members
-        return cls(jnp.asarray(padded), jnp.int32(len(members)), jnp.asarray(always, jnp.int32))
+        return cls(
+            jnp.asarray(padded), jnp.int32(len(members)), jnp.asarray(always, jnp.int32), starts
+        )
+
+
+def _by_group(
+    ids: np.ndarray, groups: np.ndarray, members: np.ndarray
+) -> tuple[np.ndarray, jax.Array]:
+    """The members ordered by group, and where each group starts."""
+    if groups.shape != ids.shape:
+        raise ValueError(f"{len(ids)} ids need as many group labels, got shape {groups.shape}.")
+    labels = groups[np.argsort(ids)][np.isin(np.sort(ids), members)]  # `members` is ascending.
+    order = np.argsort(labels, kind="stable")
+    _, sizes = np.unique(labels, return_counts=True)
+    return members[order], jnp.asarray(np.concatenate([[0], np.cumsum(sizes)]), jnp.int32)
 
 
 def check_set_size(pool: ActionPool, set_size: int, name: str = "pool") -> None:
@@ -72,6 +102,15 @@ def check_set_size(pool: ActionPool, set_size: int, name: str = "pool") -> None:
             f"({num_always} of them always available); "
             f"choose a set size in {num_always + 1}..{available}."
         )
+    if pool.group_starts is not None:
+        sizes = np.sort(np.diff(np.asarray(pool.group_starts)))
+        smallest = int(sizes[: _num_drawn_groups(len(sizes))].sum()) + num_always
+        if set_size > smallest:
+            raise ValueError(
+                f"Sets of {set_size} actions cannot be drawn from every half of the {len(sizes)} "
+                f"groups of {name}: the smallest groups hold {smallest} with those always "
+                "available. Use smaller sets, or fewer groups."
+            )
 
 
 def whole_pool(pool: ActionPool) -> AvailableSet:
@@ -86,8 +125,9 @@ def draw_sets(
 ) -> AvailableSet:
     """Draws one set per key, exactly uniformly without replacement.
 
-    By sequential rejection where sets are small against the pool, which costs a fraction of sorting
-    noise over the pool (`experiments/benchmarks`), else by the sort.
+    By sequential rejection where sets are small against what they are drawn from, which costs a
+    fraction of sorting noise over the pool (`experiments/benchmarks`), else by the sort. Of a pool
+    with groups, half of the groups are drawn first, uniformly; what is drawn from is their members.
 
     Args:
       keys: PRNG keys [...]; consumed.
@@ -102,10 +142,12 @@ def draw_sets(
     num_always = pool.always_available.shape[0]
     num_drawn = set_size - num_always
     flat_keys = keys.reshape(-1)
-    if 2 * num_drawn > pool.ids.shape[0]:
+    if pool.group_starts is not None:
+        drawn = _from_groups(flat_keys, pool, pool.group_starts, num_drawn)
+    elif 2 * num_drawn > pool.ids.shape[0]:
         drawn = jax.vmap(lambda key: _by_sorting_noise(key, pool, num_drawn))(flat_keys)
     else:
-        drawn = _by_rejection(flat_keys, pool, num_drawn)
+        drawn = pool.ids[_by_rejection(flat_keys, pool.size, num_drawn)]
     always = jnp.broadcast_to(pool.always_available, (drawn.shape[0], num_always))
     ids = jnp.concatenate([always, drawn], axis=1)
     padding = (padded_size or set_size) - set_size
@@ -113,6 +155,26 @@ def draw_sets(
     mask = jnp.broadcast_to(jnp.arange(set_size + padding) < set_size, ids.shape)
     shape = (*keys.shape, set_size + padding)
     return AvailableSet(ids.reshape(shape), mask.reshape(shape))
+
+
+def _num_drawn_groups(num_groups: int) -> int:
+    return max(1, num_groups // 2)
+
+
+def _from_groups(keys: jax.Array, pool: ActionPool, starts: jax.Array, count: int) -> jax.Array:
+    """int32[B, count] distinct members of half of the groups."""
+    num_groups = starts.shape[0] - 1
+    num_drawn = _num_drawn_groups(num_groups)
+    key_pairs = jax.vmap(jax.random.split)(keys)
+    noise = jax.vmap(lambda key: jax.random.uniform(key, (num_groups,)))(key_pairs[:, 0])
+    groups = jax.lax.top_k(noise, num_drawn)[1]  # [B, H]
+    sizes = (starts[1:] - starts[:-1])[groups]
+    ends = jnp.cumsum(sizes, axis=1)
+    # Places 0.. of the drawn groups' members put in a row, and then where they stand in the pool.
+    places = _by_rejection(key_pairs[:, 1], ends[:, -1], count)
+    group = jnp.sum(places[:, :, None] >= ends[:, None, :], axis=-1)
+    first = jnp.take_along_axis(starts[groups] - (ends - sizes), group, axis=1)
+    return pool.ids[first + places]
 
 
 def _by_sorting_noise(key: jax.Array, pool: ActionPool, count: int) -> jax.Array:
@@ -126,8 +188,8 @@ _MAX_POOL = 2**16  # The range of `_random_below`.
 _REFILL_BLOCK = 8  # Candidates per set drawn at once to replace repeats.
 
 
-def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
-    """int32[B, count] distinct members, by sequential rejection.
+def _by_rejection(keys: jax.Array, bound: jax.Array, count: int) -> jax.Array:
+    """int32[B, count] distinct numbers below `bound` int32[] or int32[B], by sequential rejection.
 
     `count` candidates are drawn at once; the places of those that repeat an earlier one are filled
     by further candidates, in blocks, until no set has an open place. The batch is the minor axis,
@@ -135,7 +197,12 @@ def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
     """
     key_pairs = jax.vmap(jax.random.split)(keys)
     keys_first, keys_refill = key_pairs[:, 0], key_pairs[:, 1]
-    candidates = jax.vmap(lambda key: _random_below(key, (count,), pool.size))(keys_first).T
+    bounds = jnp.broadcast_to(bound, keys.shape)
+
+    def draw(keys: jax.Array, count: int) -> jax.Array:
+        return jax.vmap(lambda key, bound: _random_below(key, (count,), bound))(keys, bounds).T
+
+    candidates = draw(keys_first, count)
     place = jnp.arange(count)[:, None]
 
     def mark_repeats(i: jax.Array, is_repeat: jax.Array) -> jax.Array:
@@ -146,7 +213,7 @@ def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
     def refill(carry: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
         chosen, iteration = carry
         keys_now = jax.vmap(jax.random.fold_in, in_axes=(0, None))(keys_refill, iteration)
-        extra = jax.vmap(lambda key: _random_below(key, (_REFILL_BLOCK,), pool.size))(keys_now).T
+        extra = draw(keys_now, _REFILL_BLOCK)
 
         def fill_first_open(i: jax.Array, chosen: jax.Array) -> jax.Array:
             is_new = ~jnp.any(chosen == extra[i], axis=0)
@@ -160,7 +227,7 @@ def _by_rejection(keys: jax.Array, pool: ActionPool, count: int) -> jax.Array:
         refill,
         (jnp.where(is_repeat, -1, candidates), jnp.zeros((), jnp.int32)),
     )
-    return pool.ids[chosen.T]
+    return chosen.T
 
 
 def _first_open(chosen: jax.Array) -> jax.Array:

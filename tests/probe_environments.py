@@ -139,3 +139,56 @@ def ladder(num_actions: int, num_rungs: int = 10, time_limit: int = 4) -> TableP
         next_state == num_rungs,
         time_limit=time_limit,
     )
+
+
+@struct.dataclass
+class HybridParams:
+    """A one-step task of a choice, a position and a stop bit.
+
+    Attributes:
+      targets: f32[A, k] best position of each action.
+      is_good: bool[A] the actions that are worth anything.
+    """
+
+    targets: jax.Array
+    is_good: jax.Array
+
+
+class HybridBandit(Environment[TableState, HybridParams]):
+    """A good action at its own place is worth up to 1; in half of the starts stopping is, alone.
+
+    Observation: one-hot of whether to stop. Reward: where acting is right and the choice is good,
+    `1 - mean |position - target|`; where stopping is right, 1 for a stop.
+    """
+
+    name = "HybridBandit-v0"
+    episode_metrics = ("episode_return", "has_stopped")
+
+    def __init__(self, num_actions: int, position_dim: int, has_stop: bool) -> None:
+        self._spec = ActionSpec(num_actions, position_dim, has_stop)
+
+    @property
+    def action_spec(self) -> ActionSpec:
+        return self._spec
+
+    def observation_spec(self, params: HybridParams) -> ObservationSpec:
+        return ObservationSpec((2,), jnp.float32, 0.0, 1.0)
+
+    def max_episode_steps(self, params: HybridParams) -> int:
+        return 1
+
+    def reset_env(self, key: jax.Array, params: HybridParams) -> tuple[jax.Array, TableState]:
+        start = jax.random.bernoulli(key).astype(jnp.int32) * self._spec.has_stop
+        return jnp.eye(2)[start], TableState(start, jnp.int32(0), jnp.float32(0.0))
+
+    def step_env(
+        self, key: jax.Array, state: TableState, action: Action, params: HybridParams
+    ) -> Transition:
+        del key
+        distance = jnp.abs(action.position - params.targets[action.id])
+        acted = params.is_good[action.id] * (1.0 - jnp.mean(distance)) * ~action.stop
+        reward = jnp.where(state.state == 1, action.stop.astype(jnp.float32), acted)
+        state = TableState(state.state, state.steps + 1, reward)
+        info = {"episode_return": reward, "has_stopped": action.stop}
+        obs = jnp.eye(2)[state.state]
+        return obs, state, reward, jnp.bool_(True), jnp.bool_(False), info

@@ -42,8 +42,9 @@ class DiagonalGaussian:
         log_prob = -0.5 * jnp.sum(squares + jnp.log(self.variance) + _LOG_TWO_PI, axis=-1)
         return jnp.clip(log_prob, -_LOG_PROB_BOUND, _LOG_PROB_BOUND)
 
-    def entropy(self) -> jax.Array:
+    def entropy(self, sample: jax.Array | None = None) -> jax.Array:
         """f32[...] entropy in nats, of all dimensions or per dimension."""
+        del sample
         per_dimension = 0.5 * (1.0 + _LOG_TWO_PI + jnp.log(self.variance))
         reduce = jnp.sum if self.sums_entropy else jnp.mean
         return reduce(per_dimension, axis=-1)
@@ -58,11 +59,19 @@ class _GaussianPolicy(nn.Module):
 
     size: int
 
-    @nn.compact
+    def setup(self) -> None:
+        self.encoder = VectorEncoder()
+        self.mean = orthogonal_dense(self.size, 1.0)
+        self.variance = orthogonal_dense(self.size, 1.0)
+
+    def features(self, obs: jax.Array) -> jax.Array:
+        return self.encoder(obs)
+
+    def output(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
+        return self.mean(features), nn.softplus(self.variance(features))
+
     def __call__(self, obs: jax.Array) -> tuple[jax.Array, jax.Array]:
-        features = VectorEncoder(name="encoder")(obs)
-        mean = orthogonal_dense(self.size, 1.0, "mean")(features)
-        return mean, nn.softplus(orthogonal_dense(self.size, 1.0, "variance")(features))
+        return self.output(self.features(obs))
 
 
 class ContinuousMethod:
@@ -91,9 +100,19 @@ class ContinuousMethod:
         self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> DiagonalGaussian:
         """The policy over points f32[..., d]; it does not see the available actions."""
+        return self.distribution_of(params, self.features(params, obs), projected, mask)
+
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature."""
+        return apply(_GaussianPolicy(0), params["policy"], obs, method="features")
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> DiagonalGaussian:
+        """`distribution` from the state feature f32[..., 64]."""
         del mask
         policy = _GaussianPolicy(projected.shape[-1])
-        both = apply(policy, params["policy"], obs)
+        both = apply(policy, params["policy"], features, method="output")
         return DiagonalGaussian(both[0], both[1], self._sums_entropy)
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:

@@ -23,10 +23,18 @@ class _DiscretePolicy(nn.Module):
 
     num_actions: int
 
-    @nn.compact
+    def setup(self) -> None:
+        self.encoder = VectorEncoder()
+        self.logits = orthogonal_dense(self.num_actions, _HEAD_GAIN)
+
+    def features(self, obs: jax.Array) -> jax.Array:
+        return self.encoder(obs)
+
+    def output(self, features: jax.Array) -> jax.Array:
+        return self.logits(features)
+
     def __call__(self, obs: jax.Array) -> jax.Array:
-        features = VectorEncoder(name="encoder")(obs)
-        return orthogonal_dense(self.num_actions, _HEAD_GAIN, "logits")(features)
+        return self.output(self.features(obs))
 
 
 class DiscreteMethod:
@@ -66,8 +74,18 @@ class DiscreteMethod:
         self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Categorical:
         """The policy over the train actions; it does not see the available ones."""
+        return self.distribution_of(params, self.features(params, obs), projected, mask)
+
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature."""
+        return apply(self._policy, params["policy"], obs, method="features")
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Categorical:
+        """`distribution` from the state feature f32[..., 64]."""
         del projected, mask
-        return Categorical(apply(self._policy, params["policy"], obs))
+        return Categorical(apply(self._policy, params["policy"], features, method="output"))
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[...] value of f32[..., n] normalised observations."""

@@ -1,10 +1,11 @@
-"""Probability distributions over choices, in float32 and safe with masks."""
+"""Probability distributions over choices and positions, in float32 and safe with masks."""
 
 from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
 from flax import struct
+from jax.scipy.special import betaln, digamma
 
 MASKED_LOGIT = -1e9  # Finite, so that a set with every entry masked has no NaN.
 
@@ -44,11 +45,51 @@ class Categorical:
         log_probs = jax.nn.log_softmax(self.logits)
         return jnp.take_along_axis(log_probs, choice[..., None], axis=-1)[..., 0]
 
-    def entropy(self) -> jax.Array:
-        """f32[...] entropy in nats."""
+    def entropy(self, sample: jax.Array | None = None) -> jax.Array:
+        """f32[...] entropy in nats; that of all samples, whichever was drawn."""
+        del sample
         log_probs = jax.nn.log_softmax(self.logits)
         return -jnp.sum(jnp.exp(log_probs) * log_probs, axis=-1)
 
     def mode(self) -> jax.Array:
         """int32[...] most likely choice, the first of equals."""
         return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
+
+
+_INSIDE = 1e-6  # Distance of a sample from 0 and 1: float32 draws of exactly 1 happen.
+
+
+@struct.dataclass
+class Beta:
+    """Independent Beta distributions over f32[..., k] in (0, 1).
+
+    Attributes:
+      alpha, beta: f32[..., k], positive.
+    """
+
+    alpha: jax.Array
+    beta: jax.Array
+
+    def sample(self, key: jax.Array) -> jax.Array:
+        """f32[..., k] in [1e-6, 1 - 1e-6]; consumes `key`."""
+        return jnp.clip(jax.random.beta(key, self.alpha, self.beta), _INSIDE, 1.0 - _INSIDE)
+
+    def log_prob(self, sample: jax.Array) -> jax.Array:
+        """f32[...] joint log-density of a sample f32[..., k] inside (0, 1)."""
+        numerator = (self.alpha - 1.0) * jnp.log(sample) + (self.beta - 1.0) * jnp.log1p(-sample)
+        return jnp.sum(numerator - betaln(self.alpha, self.beta), axis=-1)
+
+    def entropy(self) -> jax.Array:
+        """f32[...] differential entropy in nats, summed over the coordinates."""
+        a, b = self.alpha, self.beta
+        entropies = (
+            betaln(a, b)
+            - (a - 1.0) * digamma(a)
+            - (b - 1.0) * digamma(b)
+            + (a + b - 2.0) * digamma(a + b)
+        )
+        return jnp.sum(entropies, axis=-1)
+
+    def mode(self) -> jax.Array:
+        """f32[..., k] the mean: what the release takes for the most likely position."""
+        return self.alpha / (self.alpha + self.beta)

@@ -9,7 +9,8 @@ from typing import Any, Protocol
 import jax
 import numpy as np
 
-from jaxnew.environment import Action
+from jaxnew.environment import Action, ActionSpec
+from jaxnew.policy.auxiliary import AuxiliaryMethod
 from jaxnew.policy.continuous import ContinuousMethod
 from jaxnew.policy.discrete import DiscreteMethod
 from jaxnew.policy.utility import RandomMethod, UtilityMethod
@@ -19,13 +20,17 @@ Params = Any
 
 
 class Distribution(Protocol):
-    """A distribution over samples; a sample is a pytree, stored as it is by PPO."""
+    """A distribution over samples; a sample is a pytree, stored as it is by PPO.
+
+    `entropy` is given the sample that was drawn: a part that is conditioned on another has the
+    entropy that it has there (spec method 5.5).
+    """
 
     def sample(self, key: jax.Array) -> Any: ...
 
     def log_prob(self, sample: Any) -> jax.Array: ...
 
-    def entropy(self) -> jax.Array: ...
+    def entropy(self, sample: Any = None) -> jax.Array: ...
 
     def mode(self) -> Any: ...
 
@@ -64,10 +69,14 @@ class MethodContext:
       train_ids: int32[n] ids of the fixed action space of a discrete policy.
       sums_gaussian_entropy: whether the entropy of a continuous output is summed over its
         dimensions, as in Grid World, or averaged, as elsewhere (spec method 8.1).
+      action_spec: of the domain; what comes with a choice there gets heads. None: nothing does.
+      conditions_position: the position's head reads the chosen action too (spec method 5.5).
     """
 
     train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     sums_gaussian_entropy: bool = False
+    action_spec: ActionSpec | None = None
+    conditions_position: bool = False
 
 
 METHODS: dict[str, Callable[[MethodContext], PolicyMethod]] = {
@@ -86,4 +95,9 @@ def make_method(name: str, context: MethodContext | None = None) -> PolicyMethod
     """
     if name not in METHODS:
         raise ValueError(f"Unknown method {name!r}; choose one of {sorted(METHODS)}.")
-    return METHODS[name](context or MethodContext())
+    context = context or MethodContext()
+    method = METHODS[name](context)
+    spec = context.action_spec
+    if context.conditions_position or (spec and (spec.position_dim or spec.has_stop)):
+        return AuxiliaryMethod(method, spec or ActionSpec(0), context.conditions_position)
+    return method

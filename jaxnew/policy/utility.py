@@ -38,6 +38,10 @@ class Utility(nn.Module):
         self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,))
         self.score = nn.Dense(1, kernel_init=init)
 
+    def embedded(self, representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., 64], the action alone."""
+        return self.embed(representations)
+
     def project(self, representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., 64], the action's share of the hidden layer, bias included."""
         return self.embed(representations) @ self.kernel[FEATURE_SIZE:] + self.bias
@@ -97,9 +101,22 @@ class UtilityMethod:
           projected: f32[..., m, 64] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
-        features = apply(self._encoder, params["encoder"], obs)
+        return self.distribution_of(params, self.features(params, obs), projected, mask)
+
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature `f(s)`."""
+        return apply(self._encoder, params["encoder"], obs)
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Categorical:
+        """`distribution` from the state feature f32[..., 64]."""
         utilities = apply(self._utility, params["utility"], features, projected)
         return Categorical.masked(utilities, mask)
+
+    def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., 64]: the `a` of the module docstring."""
+        return apply(self._utility, params["utility"], representations, method="embedded")
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[...] value of f32[..., n] normalised observations."""
@@ -120,10 +137,10 @@ class RandomMethod(UtilityMethod):
 
     name = "random"
 
-    def distribution(
-        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Categorical:
         """The uniform distribution over the real entries."""
         del params, projected
-        logits = jnp.zeros((*obs.shape[:-1], mask.shape[-1]))
+        logits = jnp.zeros((*features.shape[:-1], mask.shape[-1]))
         return Categorical.masked(logits, mask)

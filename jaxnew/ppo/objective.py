@@ -107,7 +107,7 @@ def loss(
             (value - minibatch.value_target) ** 2, (clipped_value - minibatch.value_target) ** 2
         )
     )
-    entropy = jnp.mean(distribution.entropy())
+    entropy = jnp.mean(distribution.entropy(minibatch.sample))
     total = (
         policy_loss
         + hyperparameters.value_coefficient * value_loss

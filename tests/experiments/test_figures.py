@@ -519,7 +519,7 @@ def test_command_asks_for_what_it_needs(tmp_path: Path, monkeypatch: pytest.Monk
 @pytest.fixture(scope="module")
 def trainer() -> Trainer:
     table = engineered_table(skill_universe(), "gt12")
-    config = config_lib.from_dict(TrainConfig, plain_config())
+    config = TrainConfig.from_plain(plain_config())
     return Trainer.of(config, TASK, a_split(), table)
 
 
