@@ -37,7 +37,6 @@ from experiments._results import as_markdown, result_rows
 from experiments._runs import read_runs
 from experiments._training import TrainConfig, Trainer
 from experiments.tasks.grid_world import TASK
-from jaxnew import config as config_lib
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable, engineered_table
