@@ -13,6 +13,7 @@ import numpy as np
 from experiments._paper import PaperValue, paper_steps, paper_value
 from experiments._plots import Metric
 from experiments._runs import Group, Run
+from jaxnew.actions import SPLIT_NAMES
 
 RANDOM_PLAY = "random-play"  # What `demo` records in place of a checkpoint.
 
@@ -136,7 +137,7 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
 
 def is_standard(group: Group, evaluation: dict[str, Any]) -> bool:
     """Whether an evaluation of a run of the group was made as the paper's."""
-    if "first_size" in evaluation:
+    if "first_size" in evaluation or evaluation["actions"] not in SPLIT_NAMES:
         return False
     wanted = group.set_size(evaluation["actions"])
     is_whole = evaluation["set_size"] == evaluation.get("num_actions")

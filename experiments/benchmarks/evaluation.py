@@ -9,14 +9,14 @@ from typing import Any
 
 import jax
 
-from experiments.benchmarks import _grid_world
 from experiments.benchmarks import _measure as m
+from experiments.benchmarks import _trainers
 
 
 def main() -> None:
     report = m.Report("evaluation")
-    trainer = _grid_world.make_trainer()
-    state = _grid_world.trained_state(trainer, num_updates=1)
+    trainer = _trainers.make_trainer()
+    state = _trainers.trained_state(trainer, num_updates=1)
     evaluator = trainer.evaluator
     num_episodes = 200 if m.QUICK.value else 5000
     statistics = state.rollout.observation_statistics
@@ -33,7 +33,7 @@ def main() -> None:
         work={"episodes": num_episodes},
         num_envs=evaluator.width,
         includes=["set drawing", "policy", "transfer"],
-        how=f"{num_episodes} episodes on test sets; {_grid_world.describe(trainer)}",
+        how=f"{num_episodes} episodes on test sets; {_trainers.describe(trainer)}",
     )
 
 

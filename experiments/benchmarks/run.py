@@ -12,7 +12,15 @@ from absl import flags
 
 from experiments.benchmarks import _measure as m
 
-SUBJECTS = ("environment", "utility", "training", "evaluation", "representation", "sweep")
+SUBJECTS = (
+    "environment",
+    "utility",
+    "training",
+    "methods",
+    "evaluation",
+    "representation",
+    "sweep",
+)
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
 

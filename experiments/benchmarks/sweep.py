@@ -11,19 +11,27 @@ from typing import Any
 import jax
 
 from experiments._training import Trainer
-from experiments.benchmarks import _grid_world
 from experiments.benchmarks import _measure as m
+from experiments.benchmarks import _trainers
 from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
 
 NUM_MEMBERS = 8
+# A grid of the paper's size (appendix, "Hyperparameter Search"): 8 coefficients, 4 seeds each.
+GRID = "entropy_coefficient=1e-4,5e-4,1e-3,5e-3,1e-2,2e-2,5e-2,1e-1"
+GRID_SEEDS = 4
 SINGLE_RUNS = "single runs"
+GRID_NAME = "one program, grid of 32"
 RATIO = "time of the first over time of the second, for the same updates"
 
 
-def make_sweep(trainer: Trainer, devices: list[jax.Device], at_once: int) -> Sweep:
-    """Members that differ in their seed."""
-    configs = member_configs(trainer.config, [31 + member for member in range(NUM_MEMBERS)], [])
+def make_sweep(
+    trainer: Trainer, devices: list[jax.Device], at_once: int, has_grid: bool = False
+) -> Sweep:
+    """Members that differ in their seed, or a grid of hyper-parameters and seeds."""
+    num_seeds = GRID_SEEDS if has_grid else NUM_MEMBERS
+    seeds = [31 + member for member in range(num_seeds)]
+    configs = member_configs(trainer.config, seeds, [GRID] if has_grid else [])
     return Sweep.of(trainer, configs, devices, at_once)
 
 
@@ -75,6 +83,8 @@ def subjects_of(trainer: Trainer, num_updates: int) -> dict[str, m.Subject]:
             sweep = make_sweep(trainer, devices, at_once)
             name = f"one program, {len(devices)} device(s), {how}"
             subjects[name] = sweep_subject(sweep, num_updates)
+    grid = make_sweep(trainer, jax.devices(), 1, has_grid=True)
+    subjects[GRID_NAME] = sweep_subject(grid, num_updates)
     return subjects
 
 
@@ -92,27 +102,32 @@ def compare(
 def record(
     report: m.Report, trainer: Trainer, timings: dict[str, m.Timing], num_updates: int
 ) -> None:
-    steps = NUM_MEMBERS * num_updates * trainer.config.ppo.steps_per_update
     for name, timing in timings.items():
+        num_members = 32 if name == GRID_NAME else NUM_MEMBERS
+        steps = num_members * num_updates * trainer.config.ppo.steps_per_update
         report.timing(
-            f"{NUM_MEMBERS} seeds {name}",
+            name if name == GRID_NAME else f"{NUM_MEMBERS} seeds {name}",
             timing,
             work={"steps": steps},
-            num_envs=NUM_MEMBERS * trainer.config.ppo.rollout.num_envs,
+            num_envs=num_members * trainer.config.ppo.rollout.num_envs,
             includes=["auto-reset", "policy", "update"],
-            how=f"{num_updates} updates of each seed; {_grid_world.describe(trainer)}",
+            how=f"{num_updates} updates of each seed; {_trainers.describe(trainer)}",
         )
 
 
 def main() -> None:
     jax.config.update("jax_num_cpu_devices", 2)
     report = m.Report("sweep")
-    trainer = _grid_world.make_trainer()
+    trainer = _trainers.make_trainer()
     num_updates = 1 if m.QUICK.value else 2
     timings = m.measure(subjects_of(trainer, num_updates), m.REPEATS.value)
     record(report, trainer, timings, num_updates)
     for name, timing in timings.items():
-        if name != SINGLE_RUNS:
+        if name == GRID_NAME:  # Four times the work of the single runs.
+            values = {c: 4.0 * v for c, v in m.ratio(timings[SINGLE_RUNS], timing).items()}
+            how = "time per update and member of the first over that of the second; no compiling"
+            report.values(f"{SINGLE_RUNS} / {name}", values, how=how)
+        elif name != SINGLE_RUNS:
             compare(report, name, timing, timings[SINGLE_RUNS], num_updates)
 
 

@@ -20,7 +20,7 @@ from flax import struct
 
 from envs_mjx.grid_world import GridWorld, GridWorldParams, GridWorldState
 from experiments._training import Trainer
-from experiments.benchmarks import _floor, _grid_world
+from experiments.benchmarks import _floor, _trainers
 from experiments.benchmarks import _measure as m
 from jaxnew import sampling
 from jaxnew.environment import Action, Transition
@@ -230,7 +230,7 @@ LEARNING_PARTS = ("gradients", "permutation", "optimizer")
 
 def report_timings(report: m.Report, trainer: Trainer, timings: Timings) -> None:
     """Every timing, with what it is."""
-    shapes = _grid_world.describe(trainer)
+    shapes = _trainers.describe(trainer)
     config = trainer.config.ppo
     covers = {"update": ["auto-reset", "policy", "update"], "rollout": ["auto-reset", "policy"]}
     for name, timing in timings.items():
@@ -315,8 +315,8 @@ def report_floor(report: m.Report, trainer: Trainer, update: m.Timing) -> None:
 
 def main() -> None:
     report = m.Report("training")
-    trainer = _grid_world.make_trainer()
-    state = _grid_world.trained_state(trainer, num_updates=2)
+    trainer = _trainers.make_trainer()
+    state = _trainers.trained_state(trainer, num_updates=2)
     timings = m.measure(subjects_of(trainer, state), m.REPEATS.value)
     report_timings(report, trainer, timings)
     report_shares(report, timings)

@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 
 from experiments._training import Trainer
-from experiments.benchmarks import _grid_world
 from experiments.benchmarks import _measure as m
+from experiments.benchmarks import _trainers
 from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
 from jaxnew.policy.utility import Utility
@@ -64,7 +64,7 @@ METHODS: dict[str, type[UtilityMethod]] = {
 def layer_subjects(num_states: int, set_size: int, num_actions: int) -> dict[str, m.Subject]:
     """The layer alone, from state features, a table and ids; forward, and with its gradients."""
     layer: nn.Module = Utility()
-    size = _grid_world.REPRESENTATION_SIZE
+    size = _trainers.REPRESENTATION_SIZE
 
     def factored(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
         projected = layer.apply(params, table, method="project")
@@ -108,7 +108,7 @@ def gradient_subjects(
     params = jax.jit(trainer.learner.init)(
         jax.random.key(0), trainer.table, trainer.pools["train"]
     ).params
-    minibatch = jax.jit(lambda key: _grid_world.random_minibatch(key, trainer, num_transitions))
+    minibatch = jax.jit(lambda key: _trainers.random_minibatch(key, trainer, num_transitions))
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
         return params, minibatch(key), trainer.config.hyperparameters, trainer.table
@@ -140,10 +140,10 @@ def report_layer(report: m.Report) -> None:
 
 def report_microbatches(report: m.Report) -> None:
     num_transitions, sizes, default = (32, (0, 8), 8) if m.QUICK.value else (4096, SIZES, 256)
-    trainer = _grid_world.make_trainer()
+    trainer = _trainers.make_trainer()
     variants = {str(size): (UtilityMethod(), size) for size in sizes}
     timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
-    shapes = f"minibatch of {num_transitions}, 0: undivided; {_grid_world.describe(trainer)}"
+    shapes = f"minibatch of {num_transitions}, 0: undivided; {_trainers.describe(trainer)}"
     for name, timing in timings.items():
         work = {"transitions": num_transitions}
         report.timing(f"gradient, microbatches of {name}", timing, work=work, how=shapes)
@@ -157,7 +157,7 @@ def report_projection(report: m.Report) -> None:
     num_transitions, size = (16, 8) if m.QUICK.value else (2048, 128)
     variants = {name: (method(), size) for name, method in METHODS.items()}
     for set_size in (5,) if m.QUICK.value else SET_SIZES:
-        trainer = _grid_world.make_trainer(set_size)
+        trainer = _trainers.make_trainer(set_size)
         timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
         how = f"minibatch of {num_transitions}, microbatches of {size}, m = {set_size}"
         for name, timing in timings.items():

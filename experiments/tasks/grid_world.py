@@ -133,7 +133,7 @@ TASK = Task(
             "nearest-neighbour": 62_000,
             "no-subsampling": 13_000,
         },
-        evaluation=1_000,
+        evaluation=7_000,
     ),
     paper_environment="Grid World",
     representation_targets=_targets,

@@ -1,4 +1,4 @@
-"""The parts that the benchmarks of training time: Grid World at the paper's shapes, or tiny."""
+"""The parts that the benchmarks of training time, at the paper's shapes or tiny."""
 
 from __future__ import annotations
 
@@ -17,15 +17,20 @@ from jaxnew.ppo.objective import Minibatch
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.sampling import draw_sets
 
-REPRESENTATION_SIZE = 16  # Of the paper's HVAE in Grid World (spec method 3).
+REPRESENTATION_SIZE = 16  # Of the paper's HVAE in Grid World, and of products (spec method 3).
 
 
-def make_trainer(set_size: int = 50, seed: int = 31) -> Trainer:
+def make_trainer(
+    set_size: int = 0, seed: int = 31, task: str = "grid_world", method: str = "ours"
+) -> Trainer:
     """A run at the paper's shapes on a random table; with `--quick` 4 x 16 steps and sets of 5.
 
     The table holds random numbers: what a representation says does not change what it costs.
+
+    Args:
+      set_size: actions in a set; 0 for the task's.
     """
-    domain = Domain.of(load_task("grid_world"), None)
+    domain = Domain.of(load_task(task), None)
     budget = domain.task.stage_two["paper"]
     num_actions = domain.universe.num_actions
     vectors = np.random.default_rng(0).normal(size=(num_actions, REPRESENTATION_SIZE))
@@ -35,11 +40,11 @@ def make_trainer(set_size: int = 50, seed: int = 31) -> Trainer:
         universe_hash=domain.universe.hash,
         source="random numbers",
     )
-    config = TrainConfig.of(domain, "ours", "random", table, budget, seed)
+    config = TrainConfig.of(domain, method, "random", table, budget, seed)
     ppo = config.ppo
-    rollout = replace(ppo.rollout, set_size=set_size)
+    rollout = replace(ppo.rollout, set_size=set_size or ppo.rollout.set_size)
     if m.QUICK.value:
-        rollout = replace(rollout, num_envs=4, num_steps=16, set_size=min(set_size, 5))
+        rollout = replace(rollout, num_envs=4, num_steps=16, set_size=min(rollout.set_size, 5))
         ppo = replace(ppo, microbatch_size=8, num_epochs=2, num_minibatches=2)
     config = replace(config, ppo=replace(ppo, rollout=rollout))
     return Trainer.of(config, domain.task, domain.split, table)
@@ -76,7 +81,8 @@ def describe(trainer: Trainer) -> str:
     ppo = trainer.config.ppo
     rollout = ppo.rollout
     return (
-        f"Grid World, {rollout.num_envs} x {rollout.num_steps} steps, sets of {rollout.set_size} "
-        f"of {int(trainer.pools['train'].size)} actions, {ppo.num_epochs} x {ppo.num_minibatches} "
-        f"gradient steps in microbatches of {ppo.microbatch_size}, d = {trainer.table.shape[1]}"
+        f"{trainer.task.name}, {rollout.num_envs} x {rollout.num_steps} steps, "
+        f"sets of {rollout.set_size} of {int(trainer.pools['train'].size)} actions, "
+        f"{ppo.num_epochs} x {ppo.num_minibatches} gradient steps in microbatches of "
+        f"{ppo.microbatch_size}, d = {trainer.table.shape[1]}"
     )
