@@ -101,7 +101,7 @@ class KicksState:
 
 
 class Kicks(Environment[KicksState, KicksParams]):
-    """A table of 2 x 2, the puck on it, and a goal.
+    """A table of 2 x 2, the puck on it, and a goal. Its unit is half a side of the table.
 
     Observation: f32[4] the puck's (x, y), and the goal's (x, y) as seen from the puck.
     Action: `Action.id` int32[] in 0..299, a kick; any other id moves nothing, costs a kick and sets
@@ -110,6 +110,7 @@ class Kicks(Environment[KicksState, KicksParams]):
     Start: puck and goal uniform over the inner 1.8 x 1.8.
     End: terminated where the puck stops within `goal_radius` (success) or leaves the table on its
       way; truncated after `max_kicks`.
+    Parameters: `KicksParams`.
     Info: `is_success`, `is_off_table`, `invalid_action` bool[], `episode_length` int32[].
     """
 
@@ -216,7 +217,10 @@ def _stage_one(num_recordings: int, hvae: RepresentationConfig, cost: str) -> St
 
 
 _HVAE = RepresentationConfig(action_latent=8, actions_per_batch=32, recordings_per_action=16)
-_PPO = PPOConfig(rollout=RolloutConfig(num_envs=32, num_steps=128, set_size=20))
+_PPO = PPOConfig(
+    rollout=RolloutConfig(num_envs=32, num_steps=128, set_size=20), lr_steps=200 * 32 * 128
+)
+_HYPERPARAMETERS = Hyperparameters(entropy_coefficient=0.01)
 
 TASK = Task(
     name="kicks",
@@ -231,22 +235,18 @@ TASK = Task(
     stage_two={
         "smoke": StageTwoBudget(
             num_updates=4,
-            ppo=PPOConfig(
-                rollout=RolloutConfig(num_envs=8, num_steps=32, set_size=20),
-                microbatch_size=0,
-                lr_steps=1024,
+            ppo=replace(
+                _PPO, rollout=replace(_PPO.rollout, num_envs=8, num_steps=32), microbatch_size=0
             ),
-            hyperparameters=Hyperparameters(),
-            loop=LoopConfig(
-                chunk_updates=2, evaluate_every=2, evaluation_episodes=64, checkpoint_every=2
-            ),
+            hyperparameters=_HYPERPARAMETERS,
+            loop=LoopConfig(chunk_updates=2, evaluate_every=2, evaluation_episodes=64),
             final_episodes=128,
             cost="seconds",
         ),
         "laptop": StageTwoBudget(
             num_updates=200,
-            ppo=replace(_PPO, lr_steps=200 * _PPO.steps_per_update),
-            hyperparameters=Hyperparameters(entropy_coefficient=0.01),
+            ppo=_PPO,
+            hyperparameters=_HYPERPARAMETERS,
             loop=LoopConfig(),
             final_episodes=5000,
             cost="half a minute on one core",

@@ -59,6 +59,7 @@ def test_recordings_show_the_kick_from_anywhere() -> None:
     assert PLAY.format.problem(films, (3, 40, *PLAY.format.shape), True) is None
     np.testing.assert_array_equal(films[1:2], PLAY.record_block(SEED, ids[1:2], 40))
     assert not np.array_equal(films, PLAY.record_block(SEED + 1, ids, 40))
+    assert len(np.unique(films[:, :, 0, 0])) == 3 * 40  # No start is shared, also between kicks.
     assert films[:, :, 0].std(axis=1).min() > 0.4  # Starts are uniform over [-1, 1]: 0.58.
     paths = np.asarray(from_the_start(films))
     assert (paths[:, :, 0] == 0).all()

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from examples.kicks import Kicks, kick_universe
+from examples.kicks import Kicks, KicksState, kick_universe
 from jaxnew.environment import Action
 from tests import contract
 
@@ -86,6 +87,25 @@ def test_invalid_actions_are_counted_and_move_nothing() -> None:
     )
     assert np.array_equal(next_obs, obs)
     assert (int(next_state.num_kicks), float(reward), bool(info["invalid_action"])) == (1, 0, True)
+
+
+def test_a_fall_on_the_way_is_no_success() -> None:
+    """A curve that leaves the table on the right by half of `bulge` and comes back to the goal."""
+    x = kick_universe().content[:, :, 0]
+    bulge = x.max(axis=1) - x[:, -1]
+    kick = int(bulge.argmax())
+    assert bulge[kick] > 0.1
+    puck = jnp.array([1.0 + bulge[kick] / 2 - x[kick].max(), 0.0])
+    goal = puck + kick_universe().content[kick, -1]
+    assert goal[0] < 1.0
+    state = KicksState(puck, goal, jnp.int32(0))
+    _, _, reward, terminated, _, info = ENV.step_env(
+        jax.random.key(0), state, Action.of(kick), PARAMS
+    )
+    assert not info["is_success"]
+    assert info["is_off_table"]
+    assert terminated
+    assert reward == 0.0
 
 
 @pytest.mark.oracle
