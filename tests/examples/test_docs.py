@@ -9,6 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from examples.kicks import PLAY
+from experiments._artifacts import load_encoder
 from tests.experiments.commands import ROOT, read_json, run
 
 PAGES = sorted(ROOT.glob("docs/*.md"))
@@ -90,6 +92,9 @@ def test_the_domain_from_recordings_to_unseen_actions(runs: Path) -> None:
     result = read_json(path / "evaluation" / "test-best-sampled-m20.json")
     assert (result["num_actions"], result["num_episodes"]) == (75, 64)
     assert {"is_success", "is_off_table", "episode_length"} <= set(result["metrics"])
+    # The encoder of new actions is found again as well.
+    config, *_, play_format = load_encoder(runs / "kicks" / "embed-hvae-default-smoke-31")
+    assert (config.task, play_format) == (TASK_PLACE, PLAY.format)
 
 
 @pytest.mark.integration
