@@ -10,6 +10,7 @@ import pytest
 from experiments._artifacts import Domain
 from experiments._flags import UsageError, load_task
 from experiments._methods import adapted, file_name, method_of, variant_of
+from experiments._production import Cell, Source, embed_job, sweep_job
 from jaxnew.policy import UtilityMethod
 
 pytestmark = pytest.mark.unit
@@ -79,6 +80,20 @@ def test_its_budget_is_that_of_ours() -> None:
 def test_file_names() -> None:
     assert file_name("package.module:Policy") == "package-module-Policy"
     assert file_name("nearest-neighbour") == "nearest-neighbour"
+
+
+def test_commands_for_other_processes_name_the_places() -> None:
+    domain = Domain.of(load_task("someones_module:TASK"), None)
+    source = Source(domain, Path("runs"), "smoke", "smoke", 0, (1,), (), {})
+    jobs = [
+        embed_job(source, "hvae"),
+        sweep_job(source, Cell("someones_module:Policy", "gt12"), (1, 2)),
+    ]
+    for job in jobs:
+        assert "--task=someones_module:TASK" in job.command
+    assert "--method=someones_module:Policy" in job.command
+    (folder,) = [word for word in job.command if word.startswith("--workdir=")]
+    assert folder.startswith("--workdir=runs/mine/sweep-someones_module-Policy-gt12-")
 
 
 @pytest.mark.parametrize(
