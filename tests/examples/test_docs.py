@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import textwrap
@@ -40,14 +41,19 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_page(page: Path, runs: Path) -> str:
-    """Runs the page's commands in order, at smoke budget and below `runs`; their output."""
+    """Runs the page's commands in order, at smoke budget and below `runs`; their output.
+
+    Compiling takes most of the time, and nothing here depends on how well it is done.
+    """
+    environment = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
     outputs = []
     for python, flag, module, *flags in commands(page):
         assert (python, flag) == ("python", "-m")
         words = [f.replace("laptop", "smoke").replace("=runs/", f"={runs}/") for f in flags]
         is_evaluation = module == "experiments.evaluate"
         words.append("--episodes=64" if is_evaluation else f"--runs={runs}")
-        outputs.append(run(module.removeprefix("experiments."), *words))
+        name = module.removeprefix("experiments.")
+        outputs.append(run(name, *words, environment=environment))
     return "".join(outputs)
 
 
