@@ -138,7 +138,7 @@ def train_representation(
     recordings = collect_observations(domain, runs, budget.num_recordings)
     config = config_lib.set_paths(
         EmbedConfig(
-            task=domain.task.name,
+            task=domain.task.reference,
             representation=name,
             split=domain.split_name,
             split_hash=domain.split.hash,

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,8 @@ TASK = flags.DEFINE_string("task", "grid_world", "Task name, or package.module:T
 METHOD = flags.DEFINE_string(
     "method",
     "ours",
-    "ours, no-entropy, no-subsampling, continuous, nearest-neighbour, random.",
+    "ours, no-entropy, no-subsampling, continuous, nearest-neighbour, random, or "
+    "package.module:NAME of a callable (MethodContext) -> PolicyMethod.",
 )
 REPRESENTATION = flags.DEFINE_string(
     "representation",
@@ -39,29 +42,49 @@ class UsageError(ValueError):
     """The command was asked for something that does not exist or does not fit."""
 
 
+def load_place(place: str, what: str, allowed: str) -> Any:
+    """The object at `package.module:NAME`, wherever Python finds that module.
+
+    Args:
+      place: where it is.
+      what: what was asked for, and `allowed`: what may be asked for; for the message.
+
+    Raises:
+      UsageError: `place` is not of that form, or there is no such module or object.
+    """
+    module_name, _, attribute = place.partition(":")
+    if not all(part.isidentifier() for part in [*module_name.split("."), attribute]):
+        raise UsageError(f"Unknown {what}: {place!r} is not a package.module:NAME. {allowed}")
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as err:
+        if err.name is None or not f"{module_name}.".startswith(f"{err.name}."):
+            raise  # The module is there, and what it imports is not.
+        raise UsageError(
+            f"Unknown {what}: there is no module {module_name} (it has to be importable from "
+            f"{Path.cwd()} or installed). {allowed}"
+        ) from err
+    if not hasattr(module, attribute):
+        similar = difflib.get_close_matches(attribute, vars(module), 1, 0.0)
+        hint = f"; did you mean {module_name}:{similar[0]}?" if similar else "."
+        raise UsageError(f"Unknown {what}: {module_name} has no {attribute}{hint} {allowed}")
+    return getattr(module, attribute)
+
+
 def load_task(name: str) -> Task:
     """A task by name (`grid_world`) or by place (`package.module:TASK`).
 
     Raises:
       UsageError: there is no such module or object, or it is not a `Task`.
     """
-    module_name, _, attribute = name.partition(":")
-    if not attribute:
-        module_name, attribute = f"experiments.tasks.{name}", "TASK"
-    try:
-        module = importlib.import_module(module_name)
-    except ModuleNotFoundError as err:
-        if err.name is None or not module_name.startswith(err.name):
-            raise
-        known = sorted(path.stem for path in (Path(__file__).parent / "tasks").glob("[a-z]*.py"))
-        raise UsageError(
-            f"Unknown task {name!r}: there is no module {module_name}. Tasks: {', '.join(known)}; "
-            "or give package.module:TASK for one of your own."
-        ) from err
-    task = getattr(module, attribute, None)
+    known = sorted(path.stem for path in (Path(__file__).parent / "tasks").glob("[a-z]*.py"))
+    allowed = f"Tasks: {', '.join(known)}; or give package.module:TASK for one of your own."
+    is_place = ":" in name
+    place = name if is_place else f"experiments.tasks.{name}:TASK"
+    task = load_place(place, f"task {name!r}", allowed)
     if not isinstance(task, Task):
-        raise UsageError(f"{module_name}:{attribute} is {task!r}, not a jaxnew.task.Task.")
-    return task
+        raise UsageError(f"{place} is {task!r}, not a jaxnew.task.Task. {allowed}")
+    return replace(task, place=name) if is_place else task
 
 
 def budget_of(stage: Any, name: str, what: str) -> Any:

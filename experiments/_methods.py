@@ -5,11 +5,13 @@ Spec method 8 lists what each baseline and ablation changes; everything else is 
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments._flags import UsageError
+from experiments._flags import UsageError, load_place
 from jaxnew.actions import ActionSplit
 from jaxnew.environment import ActionSpec
 from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method
@@ -23,7 +25,7 @@ class Variant:
     """One method of the paper.
 
     Attributes:
-      policy: its name in `jaxnew.policy.METHODS`.
+      policy: its name in `jaxnew.policy.METHODS`, or the `package.module:NAME` of a user's own.
       has_fixed_set: trained with one set of actions that never changes.
       scores_fixed_set: it scores every action of that set, so that microbatches must be smaller.
       is_without_entropy: its entropy coefficient is 0.
@@ -47,17 +49,49 @@ VARIANTS = {
 }
 
 
+_ALLOWED = (
+    f"Methods: {', '.join(VARIANTS)}; or give package.module:NAME for one of your own, a function "
+    "or class that takes a jaxnew.policy.method.MethodContext and makes a PolicyMethod."
+)
+# What a policy must have, read off the protocol.
+_MEMBERS = [n for n in (*PolicyMethod.__annotations__, *vars(PolicyMethod)) if n[0] != "_"]
+
+
 def variant_of(name: str) -> Variant:
-    """The variant called `name`; a policy of `METHODS` is one without special settings.
+    """The variant called `name`; a policy of `METHODS`, or one of the user's own that is given by
+    its place `package.module:NAME`, is one without special settings.
 
     Raises:
-      UsageError: there is none of that name.
+      UsageError: there is none of that name or at that place.
     """
     if name in VARIANTS:
         return VARIANTS[name]
-    if name in METHODS:
-        return Variant(name)
-    raise UsageError(f"Unknown method {name!r}; choose one of {', '.join(VARIANTS)}.")
+    if ":" in name:
+        load_method(name)
+    elif name not in METHODS:
+        raise UsageError(f"Unknown method {name!r}. {_ALLOWED}")
+    return Variant(name)
+
+
+def load_method(place: str) -> Callable[[MethodContext], PolicyMethod]:
+    """What makes a policy of the user's own.
+
+    Raises:
+      UsageError: there is nothing at `place`, or nothing that can be called with a `MethodContext`.
+    """
+    make = load_place(place, f"method {place!r}", _ALLOWED)
+    if not callable(make):
+        raise UsageError(f"{place} is {make!r}, which cannot be called. {_ALLOWED}")
+    try:
+        inspect.signature(make).bind(MethodContext())
+    except TypeError as err:
+        raise UsageError(f"{place} cannot be called with one argument: {err}. {_ALLOWED}") from err
+    return make
+
+
+def file_name(method: str) -> str:
+    """A method's name as part of a file name: a place without its colon and dots."""
+    return method.replace(":", "-").replace(".", "-")
 
 
 def trained_ids(name: str, task: Task, split: ActionSplit, part: str = "train") -> np.ndarray:
@@ -105,4 +139,14 @@ def method_of(
         action_spec=action_spec,
         conditions_position=conditions_position,
     )
-    return make_method(variant_of(name).policy, context)
+    policy = variant_of(name).policy
+    if ":" not in policy:
+        return make_method(policy, context)
+    method = load_method(policy)(context)
+    lacking = [member for member in _MEMBERS if not hasattr(method, member)]
+    if lacking:
+        raise UsageError(
+            f"{policy} made {method!r}, which lacks {', '.join(lacking)}. A policy needs "
+            f"{', '.join(_MEMBERS)}; see jaxnew.policy.PolicyMethod."
+        )
+    return method

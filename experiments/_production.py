@@ -16,7 +16,7 @@ from typing import Any
 
 from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
 from experiments._flags import UsageError, budget_of
-from experiments._methods import adapted
+from experiments._methods import adapted, file_name
 from experiments._runs import Run, read_runs
 from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable
@@ -202,7 +202,7 @@ def embed_job(source: Source, representation: str) -> Job | None:
     budget = budget_of(domain.task.stage_one, source.stage_one, "Stage one")
     command = (
         "embed",
-        f"--task={domain.task.name}",
+        f"--task={domain.task.reference}",
         f"--representation={representation}",
         f"--budget={source.stage_one}",
         f"--runs={source.folder}",
@@ -215,11 +215,13 @@ def sweep_job(source: Source, cell: Cell, seeds: Sequence[int]) -> Job:
     domain = source.domain
     budget = source.budget_of(cell.method)
     listed = ",".join(map(str, seeds))
-    name = f"sweep-{cell.method}-{cell.representation}-{source.budget}-{budget.num_updates}"
+    name = (
+        f"sweep-{file_name(cell.method)}-{cell.representation}-{source.budget}-{budget.num_updates}"
+    )
     folder = domain.folder(source.folder) / f"{name}-{listed.replace(',', '-')}"
     command = (
         "sweep",
-        f"--task={domain.task.name}",
+        f"--task={domain.task.reference}",
         f"--split={domain.split_name}",
         f"--method={cell.method}",
         f"--representation={source.representation_flag(cell.representation)}",

@@ -17,6 +17,7 @@ from experiments import _flags as flag
 from experiments import _plots as plots
 from experiments._artifacts import Domain, collect_observations, load_encoder
 from experiments._evaluation import evaluate_on, record
+from experiments._methods import file_name
 from experiments._plots import Metric
 from experiments._production import Job, Source, duration, training_seconds
 from experiments._runs import Group, group_runs, read_runs
@@ -342,7 +343,7 @@ def _searched(source: Source, name: str, num_values: int, *options: str) -> list
     method, representation = flag.METHOD.value, flag.REPRESENTATION.value
     budget = source.budget_of(method)
     listed = ",".join(map(str, source.seeds))
-    stem = f"search-{name}-{method}-{Path(representation).stem}-{source.budget}"
+    stem = f"search-{name}-{file_name(method)}-{Path(representation).stem}-{source.budget}"
     digits = f"{budget.num_updates}-{listed.replace(',', '-')}"
     folder = source.domain.folder(source.folder) / f"{stem}-{digits}"
     command = (

@@ -13,7 +13,7 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
-from experiments._methods import adapted, method_of, trained_ids
+from experiments._methods import adapted, file_name, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit
@@ -76,7 +76,7 @@ class TrainConfig:
     ) -> TrainConfig:
         budget = adapted(budget, method, domain.task, domain.split)
         return cls(
-            task=domain.task.name,
+            task=domain.task.reference,
             method=method,
             representation=representation,
             table_hash=table.hash,
@@ -257,7 +257,7 @@ def train_policy(
         TrainConfig.of(domain, method, representation, table, budget, seed), assignments or []
     )
     trainer = Trainer.of(config, task, domain.split, table)
-    name = f"{method}-{Path(representation).name.removesuffix('.npz')}"
+    name = f"{file_name(method)}-{Path(representation).name.removesuffix('.npz')}"
     path = workdir or domain.folder(runs) / f"{name}-{domain.split_name}-{budget_name}-{seed}"
     with RunDirectory.open_or_create(
         path,

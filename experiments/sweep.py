@@ -24,6 +24,7 @@ from flax import struct
 
 from experiments import _flags as flag
 from experiments._artifacts import Domain, find_table
+from experiments._methods import file_name, variant_of
 from experiments._training import (
     EVALUATION_SEED,
     SPLITS_WATCHED,
@@ -238,6 +239,7 @@ def main() -> None:
     runs = Path(flag.RUNS.value)
     budget = flag.budget_of(task.stage_two, flag.BUDGET.value, "Stage two")
     name = flag.REPRESENTATION.value
+    variant_of(flag.METHOD.value)  # Before a representation is trained for it.
     table = find_table(domain, runs, name, REPRESENTATION_BUDGET.value or flag.BUDGET.value)
     base = config_lib.set_paths(
         TrainConfig.of(domain, flag.METHOD.value, name, table, budget, flag.SEED.value),
@@ -246,9 +248,8 @@ def main() -> None:
     configs = member_configs(base, parse_seeds(SEEDS.value), VARY.value)
     trainer = Trainer.of(configs[0], task, domain.split, table)
     sweep = Sweep.of(trainer, configs, jax.devices(), AT_ONCE.value)
-    path = Path(
-        flag.WORKDIR.value or domain.folder(runs) / f"sweep-{base.method}-{Path(name).stem}"
-    )
+    folder = f"sweep-{file_name(base.method)}-{Path(name).stem}"
+    path = Path(flag.WORKDIR.value or domain.folder(runs) / folder)
     plain = {"members": [config_lib.to_dict(config) for config in configs]}
     with RunDirectory.open_or_create(path, plain, flag.OVERWRITE.value) as run:
         print(

@@ -11,6 +11,7 @@ from absl import flags
 
 from experiments import _flags as flag
 from experiments._artifacts import Domain, find_table
+from experiments._methods import variant_of
 from experiments._training import train_policy
 
 REPRESENTATION_BUDGET = flags.DEFINE_string(
@@ -21,6 +22,7 @@ REPRESENTATION_BUDGET = flags.DEFINE_string(
 def main() -> None:
     domain = Domain.of(flag.load_task(flag.TASK.value), flag.SPLIT.value)
     runs = Path(flag.RUNS.value)
+    variant_of(flag.METHOD.value)  # Before a representation is trained for it.
     table = find_table(
         domain,
         runs,

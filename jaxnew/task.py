@@ -126,7 +126,7 @@ class Task:
     """A domain. Modules in `experiments/tasks/` define one called `TASK`.
 
     Attributes:
-      name: as in `--task`.
+      name: of the folder of its runs, and for a task of `experiments/tasks` what `--task` takes.
       make_environment: the environment, made when first needed.
       make_universe: all its actions.
       splits: named ways to split the universe, each from a seed; the first is the default.
@@ -139,6 +139,8 @@ class Task:
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
+      place: `package.module:NAME` that the task was loaded from, or None for one of
+        `experiments/tasks`; filled in by whoever loads it.
     """
 
     name: str
@@ -154,6 +156,12 @@ class Task:
     measured: Measured | None = None
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+    place: str | None = None
+
+    @property
+    def reference(self) -> str:
+        """What `--task` must be, so that another process finds this task."""
+        return self.place or self.name
 
     @property
     def default_split(self) -> str:

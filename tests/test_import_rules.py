@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments")
+PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 
 # Layers of `jaxnew`, lowest first. A module may import lower layers; within one layer, only along
 # `SIDEWAYS`. Files, metrics, configs and the like know nothing of what is learned.
@@ -128,7 +128,8 @@ def why_not(module: str, package: str, name: str) -> str | None:
         if is_within(name, {library}) and package != "experiments" and not is_within(module, users):
             return f"only {sorted(users)} may import {library}, which takes seconds"
     if package == "jaxnew":
-        if is_within(name, {"envs_mjx", "envs_host", "experiments", "gymnasium", "pymunk"}):
+        others = {"envs_mjx", "envs_host", "experiments", "examples", "gymnasium", "pymunk"}
+        if is_within(name, others):
             return "the method knows no simulator and no experiment"
         if is_within(name, {"jaxnew"}):
             return why_not_within_jaxnew(module, name)
@@ -136,6 +137,10 @@ def why_not(module: str, package: str, name: str) -> str | None:
         allowed = {"envs_mjx", "jaxnew.actions", "jaxnew.observations", "jaxnew.environment"}
         if not is_within(name, allowed):
             return f"envs_mjx may import {sorted(allowed)} of ours"
+    if package == "examples" and is_ours(name) and not is_within(name, {"examples", "jaxnew"}):
+        return "a domain or policy of one's own needs jaxnew only"
+    if package == "experiments" and is_within(name, {"examples"}):
+        return "experiments find what is the user's own by its place"
     if package == "envs_host":
         is_standard = name.split(".")[0] in {*sys.stdlib_module_names, "__future__"}
         if not is_standard and not is_within(name, HOST_MAY_IMPORT):
@@ -217,6 +222,10 @@ def test_actions_needs_numpy_only() -> None:
         ("envs_host/x.py", "from jaxnew import ActionSplit", "host workers"),
         ("envs_host/x.py", "from jaxnew.environment import Action", "host workers"),
         ("envs_host/x.py", 'import importlib\nimportlib.import_module("jax")', "host workers"),
+        ("examples/x.py", "from experiments._flags import load_task", "needs jaxnew only"),
+        ("examples/x.py", "from envs_mjx.grid_world import GridWorld", "needs jaxnew only"),
+        ("experiments/x.py", "from examples.kicks import TASK", "by its place"),
+        ("jaxnew/task.py", "import examples", "no simulator"),
         ("envs_host/create/x.py", "from ...jaxnew.environment import A", "host workers"),
     ],
 )

@@ -55,6 +55,20 @@ def test_wrong_names_and_values(runs: Path, flags: list[str], says: list[str]) -
         assert words in last_lines
 
 
+@pytest.mark.parametrize("command", ["train", "sweep"])
+def test_a_wrong_method_is_named_before_anything_is_made(command: str, tmp_path: Path) -> None:
+    output = run(
+        command,
+        "--budget=smoke",
+        "--representation=hvae",
+        "--method=envs_mjx.grid_world:Policy",
+        f"--runs={tmp_path / 'none'}",
+        fails=True,
+    )
+    assert "envs_mjx.grid_world has no Policy" in output
+    assert not (tmp_path / "none").exists()
+
+
 def test_tables_that_do_not_fit(policy_run: Path, runs: Path, tmp_path: Path) -> None:
     table = RepresentationTable.load(policy_run / "table.npz")
     cases = {

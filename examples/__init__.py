@@ -1,0 +1,1 @@
+"""Small complete examples; `docs/` explains how they are written, `tests/examples` runs them."""
