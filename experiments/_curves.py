@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -82,7 +81,8 @@ def learning_curves(
 
     Faint lines are the evaluations of each run. Strong lines are drawn as the paper draws its own:
     every run held at its best evaluation, then the mean and, for several runs, the deviation. The
-    axis ends where our longest run ends; a dotted line tells where the paper's curve goes to.
+    axis ends where our longest run ends; a dotted line tells where the paper's curve goes to. Where
+    several settings have curves of the paper's, these are dashed in the colours of the settings.
 
     Args:
       settings: at least one.
@@ -99,8 +99,9 @@ def learning_curves(
     right = max(ends, default=1.0)
     unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
     for axes, split in zip(panels, splits, strict=True):
-        for paper, dashes in _papers(settings):
-            _draw_paper_curve(axes, paper, dashes, split, metric, unit, right)
+        papers = _papers(settings)
+        for paper in papers:
+            _draw_paper_curve(axes, paper, len(papers) == 1, split, metric, unit, right)
         for setting in settings:
             _draw_run_curves(axes, setting, split, metric, unit)
         axes.set_title(f"{split} actions".capitalize(), fontsize=10, color=INK)
@@ -144,16 +145,15 @@ def _draw_run_curves(
     axes.plot(x, y, color=setting.color, linewidth=2.2, label=setting.label, **points)
 
 
-def _papers(settings: Sequence[CurveSetting]) -> list[tuple[CurveSetting, Any]]:
-    """One setting for each of the paper's distinct curves, and the dashes of that curve."""
-    distinct = {setting.paper_label: setting for setting in settings if setting.paper}
-    return list(zip(distinct.values(), itertools.cycle(_PAPER_DASHES), strict=False))
+def _papers(settings: Sequence[CurveSetting]) -> list[CurveSetting]:
+    """One setting for each of the paper's distinct curves."""
+    return list({setting.paper_label: setting for setting in settings if setting.paper}.values())
 
 
 def _draw_paper_curve(
     axes: Axes,
     setting: CurveSetting,
-    dashes: Any,
+    is_alone: bool,
     split: str,
     metric: Metric,
     unit: float,
@@ -163,9 +163,11 @@ def _draw_paper_curve(
     if curve is None:
         return
     x, y, band = curve.steps / unit, metric.scale * curve.mean, metric.scale * curve.std
-    axes.fill_between(x, y - band, y + band, color=PAPER_COLOR, alpha=0.15, linewidth=0)
-    axes.plot(x, y, color=PAPER_COLOR, linewidth=1.6, linestyle=dashes, label=setting.paper_label)
-    if curve.steps[-1] > 1.05 * right:
+    color, dashes = (PAPER_COLOR if is_alone else setting.color), _PAPER_DASHES[0]
+    if is_alone:
+        axes.fill_between(x, y - band, y + band, color=color, alpha=0.15, linewidth=0)
+    axes.plot(x, y, color=color, linewidth=1.6, linestyle=dashes, label=setting.paper_label)
+    if is_alone and curve.steps[-1] > 1.05 * right:
         million = 1e-6 * curve.steps[-1]
         end = f"paper after {million:.0f} million: {metric.text(curve.mean[-1])}{metric.unit}"
         axes.axhline(y[-1], color=PAPER_COLOR, linewidth=0.9, linestyle=":", label=end)
@@ -194,10 +196,14 @@ def _curve_legend(settings: Sequence[CurveSetting]) -> tuple[list[Any], list[str
     color = settings[0].color if len(settings) == 1 else INK
     handles.append(Line2D([], [], color=color, linewidth=0.9, alpha=0.45))
     labels.append("every evaluation of a run")
-    for setting, dashes in _papers(settings):
-        line = Line2D([], [], color=PAPER_COLOR, linewidth=1.6, linestyle=dashes)
+    papers = _papers(settings)
+    line = Line2D([], [], color=PAPER_COLOR, linewidth=1.6, linestyle=_PAPER_DASHES[0])
+    if len(papers) == 1:
         handles.append((Patch(color=PAPER_COLOR, alpha=0.15, linewidth=0), line))
-        labels.append(f"{setting.paper_label}, held at best (mean ± std over seeds)")
+        labels.append(f"{papers[0].paper_label}, held at best (mean ± std over seeds)")
+    elif papers:
+        handles.append(line)
+        labels.append("the paper's, in the same colours, held at best (mean over seeds)")
     return handles, labels
 
 
@@ -215,7 +221,7 @@ def reference_curves(
       metric: of the vertical axis.
       title: of the figure.
     """
-    figure = new_figure(6.4, 4.4 + 0.09 * (len(settings) + len(lines)))
+    figure = new_figure(7.4, 4.4 + 0.09 * (len(settings) + len(lines)))
     axes = figure.subplots()
     right = max(run.steps[-1] for _, _, runs in settings for run in runs)
     unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
