@@ -85,7 +85,7 @@ TASK = Task(
             "nearest-neighbour": 6_500,
             "no-subsampling": 3_100,
         },
-        evaluation=100,
+        evaluation=400,
     ),
     paper_environment="Recommender",
 )
