@@ -75,6 +75,32 @@ class RolloutState:
     discounted_return: jax.Array
 
 
+_STOCK_EPISODES = 16
+
+
+@struct.dataclass
+class _Stock:
+    """Sets that were drawn together, since many small draws inside a scan cost far more.
+
+    Attributes:
+      sets: [K, m], dealt from the first on.
+      num_dealt: int32[] how many of them are gone.
+      num_draws: int32[] stocks drawn so far in this rollout.
+    """
+
+    sets: AvailableSet
+    num_dealt: jax.Array
+    num_draws: jax.Array
+
+    def deal(self, done: jax.Array, available: AvailableSet) -> tuple[_Stock, AvailableSet]:
+        """Sets [N, m] for the next step: the next ones of the stock where `done` bool[N]."""
+        place = self.num_dealt + jnp.cumsum(done) - done
+        dealt = jax.tree.map(
+            lambda stocked, old: jnp.where(done[:, None], stocked[place], old), self.sets, available
+        )
+        return replace(self, num_dealt=self.num_dealt + jnp.sum(done)), dealt
+
+
 @dataclass(frozen=True)
 class DeviceRollout:
     """Draws sets, acts and steps; see `RolloutConfig`."""
@@ -136,20 +162,24 @@ class DeviceRollout:
         keys = (jax.random.split(key_samples, shape[0]), jax.random.split(key_envs, shape))
         if self.config.has_fixed_set:
             projected = self.method.project(params, table[state.available.ids])
-            next_sets = None
+            stock = None
         else:
             projected = self.method.project(params, table)
-            # A set for every step, used where an episode ends: one batched draw costs far less
-            # than num_steps small ones inside the scan.
-            next_sets = self._draw(key_sets, shape, pool)
+            stock = self._restocked(key_sets, jnp.int32(0), pool)
 
         def step(
-            state: RolloutState, inputs: tuple[tuple[jax.Array, jax.Array], AvailableSet | None]
-        ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
-            rows = projected if next_sets is None else projected[state.available.ids]
-            return self._step(inputs[0], state, params, table, rows, inputs[1], discount)
+            carry: tuple[RolloutState, _Stock | None], keys: tuple[jax.Array, jax.Array]
+        ) -> tuple[tuple[RolloutState, _Stock | None], tuple[RolloutBatch, jax.Array, Info]]:
+            state, stock = carry
+            rows = projected if stock is None else projected[state.available.ids]
+            state, outputs = self._step(keys, state, params, table, rows, discount)
+            if stock is not None:
+                stock = self._with_enough(stock, key_sets, pool)
+                stock, available = stock.deal(outputs[0].done, state.available)
+                state = replace(state, available=available)
+            return (state, stock), outputs
 
-        state, (batch, final_values, info) = jax.lax.scan(step, state, (keys, next_sets))
+        (state, _), (batch, final_values, info) = jax.lax.scan(step, (state, stock), keys)
         last_value = self.method.value(params, state.observation)
         next_value = jnp.concatenate([batch.value[1:], last_value[None]])
         batch = replace(batch, next_value=jnp.where(batch.done, final_values, next_value))
@@ -166,9 +196,9 @@ class DeviceRollout:
         params: Any,
         table: jax.Array,
         projected: jax.Array,
-        next_set: AvailableSet | None,
         discount: jax.Array | float,
     ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
+        """One step; the sets of the next state are still those of this one."""
         key_sample, keys_env = keys
         distribution = self.method.distribution(
             params, state.observation, projected, state.available.mask
@@ -194,7 +224,7 @@ class DeviceRollout:
         )
         batch = RolloutBatch(
             observation=state.observation,
-            available=None if next_set is None else state.available,
+            available=None if self.config.has_fixed_set else state.available,
             sample=sample,
             log_prob=distribution.log_prob(sample),
             value=value,
@@ -203,21 +233,36 @@ class DeviceRollout:
             terminated=terminated,
             done=done,
         )
-        available = state.available
-        if next_set is not None:
-            available = jax.tree.map(
-                lambda new, old: jnp.where(done[:, None], new, old), next_set, available
-            )
         next_state = RolloutState(
             env_state=env_state,
             observation=obs,
-            available=available,
+            available=state.available,
             observation_statistics=observation_statistics,
             return_statistics=return_statistics,
             discounted_return=discounted_return,
         )
         episode_info = {name: info[name] for name in self.env.episode_metrics}
         return next_state, (batch, final_value, episode_info)
+
+    def _restocked(self, key: jax.Array, num_draws: jax.Array, pool: ActionPool) -> _Stock:
+        """`_STOCK_EPISODES` sets per environment, in one batched draw."""
+        key = jax.random.fold_in(key, num_draws)
+        sets = self._draw(key, (_STOCK_EPISODES * self.config.num_envs,), pool)
+        return _Stock(sets, jnp.int32(0), num_draws + 1)
+
+    def _with_enough(self, stock: _Stock, key: jax.Array, pool: ActionPool) -> _Stock:
+        """The stock, or a new one if this one could run out in a step.
+
+        A loop that runs at most once, not `cond`: under `vmap` that would draw at every step.
+        """
+        num_envs = self.config.num_envs
+
+        def runs_out(stock: _Stock) -> jax.Array:
+            return stock.num_dealt + num_envs > _STOCK_EPISODES * num_envs
+
+        return jax.lax.while_loop(
+            runs_out, lambda stock: self._restocked(key, stock.num_draws, pool), stock
+        )
 
     def _draw(self, key: jax.Array, shape: tuple[int, ...], pool: ActionPool) -> AvailableSet:
         keys = jax.random.split(key, shape)

@@ -212,6 +212,27 @@ def test_sets_change_exactly_where_episodes_end() -> None:
     assert (batch.sample < M).all()
 
 
+@pytest.mark.property
+def test_every_episode_has_a_set_of_its_own_however_many_end() -> None:
+    num_steps = 50  # Episodes of one step: three times as many sets as are drawn at once.
+    config = replace(CONFIG, num_steps=num_steps)
+    one_step = replace(MDP, time_limit=jnp.int32(1))
+    rollout = DeviceRollout(probe.TableWorld(A), one_step, make_method("ours"), config)
+    state = rollout.init(jax.random.key(1), POOL)
+    weights = rollout.method.init(jax.random.key(2), state.observation[0], D)
+    _, batch, _ = jax.jit(rollout.collect)(
+        jax.random.key(3), state, weights, TABLE, POOL, jnp.float32(DISCOUNT)
+    )
+    assert batch.done.all()
+    ids = np.asarray(batch.available.ids)[..., :M]
+    counts = np.bincount(ids.ravel(), minlength=A)
+    # Expected 250 * 4 / 20 = 50 each, with a deviation of 6.3.
+    assert counts[2:22].min() > 20
+    assert counts.sum() == counts[2:22].sum()
+    # Of 116,280 ordered sets: 250 draws repeat one about 0.27 times.
+    assert len({tuple(row) for row in ids.reshape(-1, M).tolist()}) >= num_steps * N - 3
+
+
 @pytest.mark.unit
 def test_fields_are_time_by_environment() -> None:
     _, states, batch, sums = play(CONFIG, num_rollouts=1)
