@@ -60,9 +60,11 @@ def published_split(name: str = "default") -> ActionSplit:
         raise ValueError(f"split={name!r} is not published; choose one of {PUBLISHED_SPLITS}.")
     file = resources.files("envs_host.create.tools") / "published_splits.json"
     record = json.loads(file.read_text())
-    parts = {part: _ids(text) for part, text in record["splits"][name].items()}
+    parts = record["splits"][name]
     return ActionSplit(
-        **parts,
+        train=_ids(parts["train"]),
+        validation=_ids(parts["validation"]),
+        test=_ids(parts["test"]),
         universe_hash=tool_universe().hash,
         always_available=np.array([no_op_id()], np.int32),
     )
