@@ -11,7 +11,6 @@ from envs_host.create import handlers
 from envs_host.create.handlers import Contact
 from envs_host.create.things import Thing
 
-WORLD_SIZE = 84.0
 SUBSTEP_S = 1.0 / 30.0
 SLEEP_TIME_S = 0.3
 FAN_FRAMES = ("body", "world")

@@ -49,7 +49,7 @@ def load_level(name_or_path: str | Path) -> Level:
     near = difflib.get_close_matches(name_or_path, level_names(), n=1)
     hint = f" Did you mean {near[0]!r}?" if near else ""
     raise LevelError(
-        f"There is no level {name_or_path!r}; known are {level_names()}, or give the path of a .json "
+        f"There is no level {name_or_path!r}; known are {level_names()}, or give a path of a .json "
         f"file.{hint}"
     )
 
