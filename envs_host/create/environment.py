@@ -44,8 +44,8 @@ class CreateEnv(gymnasium.Env):
     action: placed, no_op, blocked, invalid). At the end also `ends`, why, and `summary`, the totals
     of `episode.Summary`.
 
-    Start: the level's positions, plus noise unless `deterministic`. All that is random (noise, action
-    sets) comes from the seed given to `reset`.
+    Start: the level's positions, plus noise unless `deterministic`. Noise and action sets come from
+    the seed given to `reset`.
 
         env = CreateEnv("Push", config=CreateConfig(observation="none"))
         observation, info = env.reset(seed=0)
