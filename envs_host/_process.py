@@ -114,13 +114,18 @@ class WorkerProcess:
         except TimeoutError:
             raise self._hung(timeout_s) from None
 
-    def read(self, timeout_s: float) -> tuple[int, Any]:
+    def read(self, timeout_s: float, since: float | None = None) -> tuple[int, Any]:
         """The next answer, as (code, payload).
+
+        Args:
+          timeout_s: how long to wait for it.
+          since: the time on the monotonic clock from which to count; None for now.
 
         Raises:
           Lost: the worker failed or ended, or there was no answer in time. It is dead then.
         """
-        self._channel.socket.settimeout(max(timeout_s, 1e-3))
+        left_s = timeout_s if since is None else since + timeout_s - time.monotonic()
+        self._channel.socket.settimeout(max(left_s, 1e-3))
         try:
             code, payload = self._channel.receive()
         except TimeoutError:

@@ -128,14 +128,14 @@ class Workers:
         Raises:
           WorkerError: a worker is lost and may not be replaced; all are closed then.
         """
-        deadline = time.monotonic() + self._timeout_s
+        since = time.monotonic()
         for w, worker in enumerate(self._workers):
             while half not in worker.answers:
                 try:
-                    worker.read(deadline - time.monotonic())
+                    worker.read(self._timeout_s, since)
                 except Lost as err:
                     self._replace(w, err, has_observations=True)
-                    deadline = time.monotonic() + self._timeout_s
+                    since = time.monotonic()
         self.in_flight.remove(half)
 
     def restore(self) -> None:

@@ -182,7 +182,7 @@ class HostPool:
 
         Raises:
           WorkerError: a worker is lost and may not be replaced. The pool is closed then, but for
-            `state_dict`, which gives the state after the last decisions that were received.
+            `state_dict`, which gives each half's state after its last decision that was received.
           ReplayMismatch: a worker was replaced, but its environments came out otherwise.
           RuntimeError: nothing was sent, or the pool is closed.
         """
