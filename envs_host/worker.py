@@ -217,7 +217,7 @@ def _exit_without_parent(end: socket.socket, parent: int) -> None:
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})  # The main thread's to answer.
     poll = select.poll()
     poll.register(end, 0)  # No event but that the other end is closed.
-    while not poll.poll(5000) and os.getppid() == parent:
+    while not poll.poll(2000) and os.getppid() == parent:
         pass
     time.sleep(GRACE_S)
     os._exit(1)
