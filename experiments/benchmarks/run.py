@@ -20,6 +20,7 @@ SUBJECTS = (
     "evaluation",
     "representation",
     "sweep",
+    "pool",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
