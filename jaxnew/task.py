@@ -139,6 +139,8 @@ class Task:
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
+      actions_name: folder of recordings and encoders, for tasks that share their actions and play;
+        also a name that `--task` takes for one of them. None for a task with its own.
       place: `package.module:NAME` that the task was loaded from, or None for one of
         `experiments/tasks`; filled in by whoever loads it.
     """
@@ -156,6 +158,7 @@ class Task:
     measured: Measured | None = None
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+    actions_name: str | None = None
     place: str | None = None
 
     @property
