@@ -109,6 +109,25 @@ class Baselines:
 
 
 @dataclass(frozen=True)
+class ActionStudy:
+    """Pools of actions that a trained policy is evaluated on, from easy to hard.
+
+    Attributes:
+      axis: what `values` are.
+      values: the paper's.
+      ids: `(table f32[A, d], value) -> int32[n]` actions that sets are drawn from.
+      note: the rule, for readers of the table.
+      paper_method: `value ->` name of the row in the paper's results, or None if it has none.
+    """
+
+    axis: str
+    values: tuple[float, ...]
+    ids: Callable[[np.ndarray, float], np.ndarray]
+    note: str
+    paper_method: Callable[[float], str] | None = None
+
+
+@dataclass(frozen=True)
 class Measured:
     """Speeds on one core of the machine that `README.md` names; for foretelling durations.
 
@@ -139,6 +158,7 @@ class Task:
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
+      studies: what `analyze` offers for this task beside what it offers for every one.
       actions_name: folder of recordings and encoders, for tasks that share their actions and play;
         also a name that `--task` takes for one of them. None for a task with its own.
       place: `package.module:NAME` that the task was loaded from, or None for one of
@@ -158,6 +178,7 @@ class Task:
     measured: Measured | None = None
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+    studies: Mapping[str, ActionStudy] = field(default_factory=dict)
     actions_name: str | None = None
     place: str | None = None
 
