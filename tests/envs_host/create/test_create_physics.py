@@ -305,7 +305,7 @@ def test_planks_are_no_moving_objects(region: Thing) -> None:
     stage.add(plank)
     states = run(stage, plank.body, 20)
     assert np.abs(states[:, 0] - 42.0).max() < 0.5
-    assert not stage.caught
+    assert not stage.ledger.caught
 
 
 @pytest.mark.unit
