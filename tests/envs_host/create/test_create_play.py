@@ -133,6 +133,20 @@ def test_the_no_op_counts_nearness_at_the_end_of_a_run() -> None:
 
 
 @pytest.mark.unit
+@pytest.mark.parametrize(("speed", "counts"), [(30.0, False), (10.0, True)])
+def test_a_no_op_passed_between_two_ends_of_runs_has_no_contact(
+    monkeypatch: pytest.MonkeyPatch, speed: float, counts: bool
+) -> None:
+    # Near is within 0.1 * sqrt(8) * 42 = 11.9 units; a state comes every 1/3 s, a run is 1 s.
+    monkeypatch.setattr(play, "_velocity", lambda rng, start, target, trial: (speed, 0.0))
+    monkeypatch.setattr(play, "_ball_start", lambda rng, centred: (0.0, 0.0))
+    config = PlayConfig(centred=True)
+    throw = play._Throw(np.random.default_rng(0), all_tools()[2365], (0.0, 0.0), 0, config)
+    throw.simulate()
+    assert (throw.contact_state, throw.has_contact) == (0, counts)
+
+
+@pytest.mark.unit
 def test_eight_trials_at_most_and_overlaps_are_thrown_again(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
