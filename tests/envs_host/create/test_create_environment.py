@@ -154,7 +154,7 @@ def test_samplers_can_be_replaced_and_are_checked() -> None:
     config = dataclasses.replace(BLIND, action_set_size=4)
     env = CreateEnv("Push", config=config, candidates=[8, 5, 3, 9, 4], sampler=lowest)
     assert env.reset(seed=0)[1]["available_ids"].tolist() == [2365, 4, 5, 8]
-    wrong = CreateEnv("Push", config=config, sampler=lambda rng, candidates, size: [1, 1, 2, 3])
+    wrong = CreateEnv("Push", config=config, sampler=lambda rng, candidates, size: [15, 15, 16, 17])
     with pytest.raises(ValueError, match="4 distinct ids"):
         wrong.reset(seed=0)
 

@@ -13,6 +13,7 @@ import yaml
 from envs_host.create import things
 from envs_host.create.config import CreateConfig, RewardConfig
 from envs_host.create.episode import End, Episode, Outcome
+from envs_host.create.geometry import scaled_distance
 from envs_host.create.layout import Layout
 from envs_host.create.levels import TASK_NAMES, load_level, parse_level
 from envs_host.create.sprites import Kind, Tone
@@ -285,7 +286,9 @@ def test_goal_and_subgoals_are_worth_less_with_every_tool() -> None:
     assert episode.summary.subgoal_reward == pytest.approx(1.7)
     assert len(episode.world.target_subgoals) == 2
     assert sum(s.kind == Kind.SUBGOAL for s in episode.world.sprites()) == 2
+    episode.world.target.body.position = 75.0, 70.0  # Out of the way: the disc blocks no more.
     assert episode.step(NO_OP, (0.0, 0.0)).reward == pytest.approx(0.01)
+    assert episode.world.check_placement(TOOLS[360], (-0.15, 0.28)) == Placement.PLACED
 
 
 @pytest.mark.unit
@@ -461,12 +464,29 @@ def test_drawing_order() -> None:
 
 
 @pytest.mark.unit
+def test_subgoals_of_the_marker_come_before_the_targets() -> None:
+    marker = {"key": "m", "type": "marker_ball", "pos": [0.8, 0.9]}
+    subgoals = {"for_target": [[-0.5, 0.5]], "for_marker": [[0.5, 0.5]]}
+    level = custom(kind="marker", objects=[marker], subgoals=subgoals)
+    assert [sprite.x for sprite in start(level).world.sprites()][-2:] == [63.0, 21.0]
+
+
+@pytest.mark.oracle
+def test_distances_are_clipped_and_scaled() -> None:
+    assert scaled_distance((0.0, 0.0), (84.0, 84.0)) == pytest.approx(1.0)
+    assert scaled_distance((42.0, 42.0), (42.0, 84.0)) == pytest.approx(1.0 / math.sqrt(8.0))
+    assert scaled_distance((42.0, 42.0), (42.0, 99.0)) == pytest.approx(1.0 / math.sqrt(8.0))
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize("name", TASK_NAMES)
 def test_looks_of_the_levels(name: str) -> None:
     sprites = list(start(name).world.sprites())
     kinds = {"Basket": (Kind.BASKETBALL, Kind.BASKET_GOAL), "Collide": (Kind.DISC, Kind.DISC),
              "Moving": (Kind.DISC, Kind.DISC)}  # fmt: skip
     assert (sprites[0].kind, sprites[1].kind) == kinds.get(name, (Kind.DISC, Kind.STAR))
+    tones = {"Basket": (Tone.PICTURE, Tone.PICTURE)}.get(name, (Tone.TARGET, Tone.GOAL))
+    assert (sprites[0].tone, sprites[1].tone) == tones
     if name == "Push":
         target, star = sprites[0], sprites[1]
         assert (target.x, target.y, target.size) == pytest.approx((46.2, 36.12, 4.0))

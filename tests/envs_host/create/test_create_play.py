@@ -116,6 +116,8 @@ def test_throws_aim_at_the_tool_and_grow_faster() -> None:
         scale = 25.0 * (1.0 + 0.4 * trial)
         assert 0.6 * scale <= min(speeds) < 0.61 * scale
         assert 1.39 * scale < max(speeds) <= 1.4 * scale
+    near = [math.hypot(*play._velocity(rng, (0.0, 0.0), (0.3, 0.4), 0)) for _ in range(300)]
+    assert 1.39 * 12.5 * 1.5 < max(near) <= 1.4 * 12.5 * 1.5  # d = 0.5.
 
 
 @pytest.mark.unit
@@ -130,6 +132,20 @@ def test_the_no_op_counts_nearness_at_the_end_of_a_run() -> None:
     near = np.array([(d < 0.1).any() for d in distances])
     assert near[counted].all()
     assert np.mean([d[3] < 0.1 for d, c in zip(distances, counted, strict=True) if c]) > 0.3
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(("speed", "counts"), [(30.0, False), (10.0, True)])
+def test_a_no_op_passed_between_two_ends_of_runs_has_no_contact(
+    monkeypatch: pytest.MonkeyPatch, speed: float, counts: bool
+) -> None:
+    # Near is within 0.1 * sqrt(8) * 42 = 11.9 units; a state comes every 1/3 s, a run is 1 s.
+    monkeypatch.setattr(play, "_velocity", lambda rng, start, target, trial: (speed, 0.0))
+    monkeypatch.setattr(play, "_ball_start", lambda rng, centred: (0.0, 0.0))
+    config = PlayConfig(centred=True)
+    throw = play._Throw(np.random.default_rng(0), all_tools()[2365], (0.0, 0.0), 0, config)
+    throw.simulate()
+    assert (throw.contact_state, throw.has_contact) == (0, counts)
 
 
 @pytest.mark.unit
