@@ -281,6 +281,12 @@ def test_a_factory_that_does_not_work(factory: str, kwargs: dict[str, Any], mess
 
 
 @pytest.mark.unit
+def test_workers_that_make_different_environments() -> None:
+    with pytest.raises(ValueError, match="The workers made different environments"):
+        HostPool(f"{NAME}:Broken", {"how": "process"}, 4, 2, 0)
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("how", "message"),
     [

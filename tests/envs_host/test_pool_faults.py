@@ -220,6 +220,31 @@ def test_a_replacement_that_differs_is_refused() -> None:
 
 
 @pytest.mark.integration
+def test_a_replacement_of_another_kind_is_refused() -> None:
+    factory = f"{NAME}:Broken"
+    with HostPool(
+        factory, {"how": "process"}, 2, 1, 0, on_worker_death="restart", max_restarts=2
+    ) as pool:
+        end_of(pool.worker_pids[0])
+        with pytest.raises(WorkerError, match="came back with other environments: Format") as error:
+            pool.reset()
+        assert error.value.worker == 0
+
+
+@pytest.mark.integration
+def test_a_worker_that_does_not_read_is_reported() -> None:
+    """Its socket cannot hold the actions that it is to replay."""
+    num_steps = 20_000
+    with HostPool(CHAOTIC, {}, 2, 1, 0, timeout_s=TIMEOUT_S) as pool:
+        pool.reset()
+        state = pool.state_dict(num_steps)
+        state["lengths"][:] = num_steps
+        os.kill(pool.worker_pids[0], signal.SIGSTOP)
+        with pytest.raises(WorkerError, match="gave no answer in 3 s"):
+            pool.load_state(state)
+
+
+@pytest.mark.integration
 def test_a_start_that_hangs_is_reported() -> None:
     with pytest.raises(WorkerError, match="gave no answer in 2 s") as caught:
         HostPool(f"{NAME}:misbehave", {"fault": "hang"}, 2, 1, 0, start_timeout_s=2.0)
