@@ -142,6 +142,7 @@ class Spy(Chaotic):
 
 
 def misbehave(fault: str) -> None:
+    print(f"about to {fault}")
     if fault == "raise":
         raise ZeroDivisionError("a fault in the physics")
     if fault == "exit":

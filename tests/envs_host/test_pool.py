@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -176,8 +178,16 @@ def test_what_the_environments_are() -> None:
         assert len(set(pool.worker_pids)) == 2
 
 
+@pytest.fixture
+def ctrl_c_raises() -> Iterator[None]:
+    """Also where the tests run in a shell's background, so that it is ignored from the start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.integration
-def test_workers_have_no_jax_one_thread_and_no_ctrl_c() -> None:
+def test_workers_have_no_jax_one_thread_and_no_ctrl_c(ctrl_c_raises: None) -> None:
     import jax
 
     assert jax.__name__ in sys.modules

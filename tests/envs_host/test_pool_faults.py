@@ -73,7 +73,9 @@ def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         ("SIGSTOP", "gave no answer in 3 s", ""),
     ],
 )
-def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, detail: str) -> None:
+def test_a_fault_is_reported_with_all_that_is_known(
+    fault: str, reason: str, detail: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     hangs = fault in ("hang", "SIGSTOP")
     timeout_s = TIMEOUT_S if hangs else 60.0
     with HostPool(FAULTY, {"fault": fault}, NUM_ENVS, 2, SEED, timeout_s=timeout_s) as pool:
@@ -89,6 +91,7 @@ def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, det
         with pytest.raises(RuntimeError, match="The pool is closed: worker 1 was lost"):
             pool.reset()
     error = caught.value
+    assert capfd.readouterr() == ("", f"about to {fault}\n")  # Printed before the end, not lost.
     assert error.worker == 1
     assert error.environments == (1, 3)
     assert error.seeds == tuple((SEED, (i, int(state["episodes"][i]))) for i in (1, 3))
@@ -106,7 +109,7 @@ def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, det
 
 
 @pytest.mark.integration
-def test_a_state_after_a_loss_is_that_of_the_last_step(tmp_path: Path) -> None:
+def test_a_state_after_a_loss_is_that_of_the_last_step() -> None:
     bad = (5, 1)  # In half 0, so neither half is received.
     expected, steps = undisturbed(bad), actions(bad)
     with HostPool(FAULTY, {"fault": "SIGKILL"}, NUM_ENVS, 2, SEED) as pool:
