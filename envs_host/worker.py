@@ -63,10 +63,8 @@ class Host:
                 self._environments[i] = make(**self._setup.kwargs)
         self.environment = None
         self.format = self._common_format()
-        self._shape, self._dtype = (
-            self.format.observation_shape,
-            np.dtype(self.format.observation_dtype),
-        )
+        self._shape = self.format.observation_shape
+        self._dtype = np.dtype(self.format.observation_dtype)
         self._metric_names = frozenset(self.format.episode_metrics)
 
     def _common_format(self) -> Format:

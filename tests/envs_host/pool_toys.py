@@ -121,7 +121,7 @@ class Broken(Chaotic):
 
 
 class Spy(Chaotic):
-    """Tells about its process, and prints."""
+    """Tells about its process, and prints what is done to it."""
 
     position_dim = 0
     episode_metrics = ("has_jax", "ignores_sigint", "num_threads", "num_cores", "pid")
@@ -139,6 +139,9 @@ class Spy(Chaotic):
             "pid": os.getpid() % 2**16,
         }
         return observation, reward, terminated, truncated, metrics
+
+    def close(self) -> None:
+        print("closed")
 
 
 def misbehave(fault: str) -> None:

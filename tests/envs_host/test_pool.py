@@ -213,7 +213,7 @@ def test_pinned_workers_keep_to_one_core_each() -> None:
 
 
 @pytest.mark.integration
-def test_what_workers_print_is_on_stderr() -> None:
+def test_what_workers_print_is_on_stderr_until_environments_are_closed() -> None:
     script = (
         "import numpy as np; from envs_host.pool import HostPool\n"
         f"with HostPool('{NAME}:Spy', {{}}, 4, 2, 0) as pool:\n"
@@ -224,7 +224,9 @@ def test_what_workers_print_is_on_stderr() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "printed by the parent\n"
-    assert sorted(done.stderr.splitlines()) == [f"printed by {i}" for i in range(4)]
+    lines = done.stderr.splitlines()
+    assert sorted(lines[:4]) == [f"printed by {i}" for i in range(4)]
+    assert lines[4:] == ["closed"] * 4
 
 
 @pytest.mark.integration
