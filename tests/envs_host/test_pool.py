@@ -13,7 +13,10 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from envs_host import pool as pool_module
 from envs_host.pool import HostPool, HostStep, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, NAME, Chaotic
 
@@ -135,6 +138,21 @@ def test_a_half_may_run_ahead() -> None:
                 assert_same(found, {name: expected[name][t, rows] for name in found})
 
 
+@pytest.mark.property
+@given(st.integers(1, 6), st.integers(1, 20), st.data())
+def test_workers_share_every_half_evenly(num_halves: int, size: int, data: st.DataObject) -> None:
+    num_workers = data.draw(st.integers(1, size))
+    setups = pool_module._setups("", {}, num_halves * size, num_workers, num_halves, False)
+    for half in range(num_halves):
+        held = [list(range(*setup.halves[half])) for setup in setups]
+        together = [i for environments in held for i in environments]
+        assert together == list(range(half * size, (half + 1) * size))
+        assert {len(environments) for environments in held} <= {
+            size // num_workers,
+            -(-size // num_workers),
+        }
+
+
 @pytest.mark.unit
 def test_a_second_reset_starts_the_next_episodes() -> None:
     with HostPool(CHAOTIC, {}, 4, 2, SEED) as pool:
@@ -145,6 +163,7 @@ def test_a_second_reset_starts_the_next_episodes() -> None:
                 seed = np.random.SeedSequence(SEED, spawn_key=(i, episode))
                 np.testing.assert_array_equal(found[i], Chaotic().reset(seed))
             np.testing.assert_array_equal(pool.episodes, episode)
+            pool.step(np.zeros(4, int), np.zeros((4, 2)))
 
 
 @pytest.mark.unit
