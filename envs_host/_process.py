@@ -70,7 +70,6 @@ class WorkerProcess:
     def start(self) -> None:
         """Starts the process, anew if it was there; it will answer with its format."""
         self.stop(grace_s=0.0)
-        self.answers.clear()
         self._report = tempfile.TemporaryFile()  # noqa: SIM115 It lives as long as the process.
         here, there = socket.socketpair()
         self._channel = Channel(here)

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from envs_host import _process
+from envs_host._memory import Setup
 from envs_host.pool import HostPool, ReplayMismatch, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, FAULTY, NAME
 
@@ -235,16 +236,33 @@ def test_a_replacement_of_another_kind_is_refused() -> None:
 
 
 @pytest.mark.integration
-def test_a_worker_that_does_not_read_is_reported() -> None:
+def test_a_worker_that_does_not_read_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     """Its socket cannot hold the actions that it is to replay."""
     num_steps = 20_000
     with HostPool(CHAOTIC, {}, 2, 1, 0, timeout_s=TIMEOUT_S) as pool:
         pool.reset()
         state = pool.state_dict(num_steps)
         state["lengths"][:] = num_steps
+        # Known from sending: waiting for an answer as well would take twice the timeout.
+        monkeypatch.setattr(_process.WorkerProcess, "read", None)
         os.kill(pool.worker_pids[0], signal.SIGSTOP)
         with pytest.raises(WorkerError, match="gave no answer in 3 s"):
             pool.load_state(state)
+
+
+@pytest.mark.integration
+def test_a_worker_that_is_just_starting_ignores_ctrl_c_and_is_started_once() -> None:
+    worker = _process.WorkerProcess(Setup(CHAOTIC, {}, 1, ((0, 1),), None))
+    try:
+        worker.start()
+        first = worker.pid
+        worker.start()
+        os.kill(worker.pid, signal.SIGINT)  # Long before Python can run a line of it.
+        with pytest.raises(ProcessLookupError):
+            os.kill(first, 0)
+        assert worker.read(60.0)[1].position_dim == 2
+    finally:
+        worker.stop(grace_s=0.0)
 
 
 @pytest.mark.integration
