@@ -57,7 +57,13 @@ class Channel:
 
     def receive(self) -> tuple[int, Any]:
         """The next code and its payload, None if it has none."""
-        code = self._receive_exactly(1)[0]
+        try:
+            data = self.socket.recv(1)
+        except ConnectionError as err:
+            raise HungUp from err
+        if not data:
+            raise HungUp
+        code = data[0]
         if code not in _WITH_PAYLOAD:
             return code, None
         (length,) = _LENGTH.unpack(self._receive_exactly(_LENGTH.size))

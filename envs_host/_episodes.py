@@ -30,7 +30,7 @@ class Episodes:
 
     @property
     def have_begun(self) -> bool:
-        return bool((self.numbers >= 0).all())
+        return bool(self.numbers[0] >= 0)  # All begin together.
 
     def share(self, numbers: np.ndarray, position_dim: int) -> None:
         """Keeps the episode numbers in the given array from now on."""
@@ -46,8 +46,9 @@ class Episodes:
     def act(self, rows: slice, ids: np.ndarray, positions: np.ndarray, is_end: np.ndarray) -> None:
         """Notes a decision in the environments of `rows`, and that episodes ended with it."""
         self.log.append(rows, ids, positions)
-        self.log.clear(rows.start + np.flatnonzero(is_end))
-        self.numbers[rows] += is_end
+        if is_end.any():
+            self.log.clear(rows.start + np.flatnonzero(is_end))
+            self.numbers[rows] += is_end
 
     def restore(self, environments: Iterable[int]) -> Restore:
         """What a worker needs to bring these environments here."""

@@ -68,8 +68,8 @@ class WorkerProcess:
         return self._process.pid
 
     def start(self) -> None:
-        """Starts the process; it will answer with its format."""
-        self.answers.clear()
+        """Starts the process, anew if it was there; it will answer with its format."""
+        self.stop(grace_s=0.0)
         self._report = tempfile.TemporaryFile()  # noqa: SIM115 It lives as long as the process.
         here, there = socket.socketpair()
         self._channel = Channel(here)
@@ -106,7 +106,7 @@ class WorkerProcess:
         Raises:
           Lost: it was not read in time.
         """
-        self._channel.socket.settimeout(timeout_s)
+        self._set_timeout(timeout_s)
         try:
             self._channel.send(code, payload)
         except HungUp:
@@ -114,18 +114,13 @@ class WorkerProcess:
         except TimeoutError:
             raise self._hung(timeout_s) from None
 
-    def read(self, timeout_s: float, since: float | None = None) -> tuple[int, Any]:
+    def read(self, timeout_s: float) -> tuple[int, Any]:
         """The next answer, as (code, payload).
-
-        Args:
-          timeout_s: how long to wait for it.
-          since: the time on the monotonic clock from which to count; None for now.
 
         Raises:
           Lost: the worker failed or ended, or there was no answer in time. It is dead then.
         """
-        left_s = timeout_s if since is None else since + timeout_s - time.monotonic()
-        self._channel.socket.settimeout(max(left_s, 1e-3))
+        self._set_timeout(timeout_s)
         try:
             code, payload = self._channel.receive()
         except TimeoutError:
@@ -138,6 +133,10 @@ class WorkerProcess:
         if code < codes.FIRST_CODE:
             self.answers.add(code)
         return code, payload
+
+    def _set_timeout(self, timeout_s: float) -> None:
+        if self._channel.socket.gettimeout() != timeout_s:
+            self._channel.socket.settimeout(timeout_s)
 
     def _hung(self, timeout_s: float) -> Lost:
         """Kills a worker that does not answer, after asking it where it is."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import os
-import time
 import weakref
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -128,14 +127,12 @@ class Workers:
         Raises:
           WorkerError: a worker is lost and may not be replaced; all are closed then.
         """
-        since = time.monotonic()
         for w, worker in enumerate(self._workers):
             while half not in worker.answers:
                 try:
-                    worker.read(self._timeout_s, since)
+                    worker.read(self._timeout_s)
                 except Lost as err:
                     self._replace(w, err, has_observations=True)
-                    since = time.monotonic()
         self.in_flight.remove(half)
 
     def restore(self) -> None:

@@ -73,7 +73,8 @@ class HostPool:
       num_halves: 2, or 1 for no overlap; more are possible.
       on_worker_death: where a worker dies, raises or gives no answer, "raise" a `WorkerError` and
         close the pool, or "restart": replace it exactly, with a warning in the log of this module.
-      timeout_s: how long `receive` waits for a worker, which may have other halves to finish first.
+      timeout_s: how long a worker may be silent while `receive` waits for it, which includes other
+        halves that it has to finish first.
       start_timeout_s: how long a worker may take to import the factory and to make its
         environments.
       max_restarts: in the life of the pool; where one more is needed, it raises.
@@ -110,6 +111,8 @@ class HostPool:
             max_restarts=max_restarts if on_worker_death == "restart" else 0,
         )
         self._arrays = self._workers.arrays
+        self._observations = _read_only(self._arrays.observations)
+        self._final_observations = _read_only(self._arrays.final_observations)
 
     @property
     def observation_shape(self) -> tuple[int, ...]:
@@ -154,7 +157,7 @@ class HostPool:
         self._check_idle()
         self._episodes.begin_next()
         self._workers.restore()
-        return _read_only(self._arrays.observations)
+        return self._observations[:]
 
     def send(self, half: int, ids: np.ndarray, positions: np.ndarray | None = None) -> None:
         """Has the workers do one decision in a half; they start at once.
@@ -173,7 +176,10 @@ class HostPool:
         if half in self._workers.in_flight:
             raise RuntimeError(f"Half {half} is running; receive it first.")
         rows = self.rows(half)
-        ids, positions = self._checked_actions(ids, positions, rows.stop - rows.start)
+        self._send(half, *self._checked_actions(ids, positions, rows.stop - rows.start))
+
+    def _send(self, half: int, ids: np.ndarray, positions: np.ndarray) -> None:
+        rows = self.rows(half)
         self._arrays.ids[rows], self._arrays.positions[rows] = ids, positions
         self._workers.send(half)
 
@@ -189,27 +195,31 @@ class HostPool:
         self._check_half(half)
         if half not in self._workers.in_flight:
             raise RuntimeError(f"Half {half} is not running; send actions first.")
+        self._receive(half)
+        return self._result(self.rows(half))
+
+    def _receive(self, half: int) -> None:
         self._workers.wait(half)
         arrays, rows = self._arrays, self.rows(half)
         is_end = arrays.terminated[rows] | arrays.truncated[rows]
         self._episodes.act(rows, arrays.ids[rows], arrays.positions[rows], is_end)
-        return self._result(rows)
 
     def step(self, ids: np.ndarray, positions: np.ndarray | None = None) -> HostStep:
         """One decision in all environments: ids [N], positions [N, k]; see `send`, `receive`."""
         self._check_idle()
+        self._check_begun()
         ids, positions = self._checked_actions(ids, positions, self.num_envs)
         for half in range(self.num_halves):
-            self.send(half, ids[self.rows(half)], positions[self.rows(half)])
+            self._send(half, ids[self.rows(half)], positions[self.rows(half)])
         for half in range(self.num_halves):
-            self.receive(half)
+            self._receive(half)
         return self._result(slice(0, self.num_envs))
 
     def _result(self, rows: slice) -> HostStep:
         arrays = self._arrays
         return HostStep(
-            _read_only(arrays.observations[rows]),
-            _read_only(arrays.final_observations[rows]),
+            self._observations[rows],
+            self._final_observations[rows],
             arrays.rewards[rows].copy(),
             arrays.terminated[rows].copy(),
             arrays.truncated[rows].copy(),
@@ -252,7 +262,7 @@ class HostPool:
         self._episodes.load(state)
         self._workers.restore()
         self._workers.check_replay(dict(enumerate(np.asarray(state["observation_crc"]).tolist())))
-        return _read_only(self._arrays.observations)
+        return self._observations[:]
 
     def close(self) -> None:
         """Ends the workers; arrays that were handed out stay valid."""
@@ -296,11 +306,9 @@ class HostPool:
         if positions is None and self.position_dim == 0:
             positions = np.zeros((n, 0), np.float32)
         positions = np.asarray(positions)
-        if ids.shape != (n,) or not np.issubdtype(ids.dtype, np.integer):
+        if ids.shape != (n,) or ids.dtype.kind not in "iu":
             raise ValueError(f"ids are {ids.dtype}{list(ids.shape)}; they must be integer[{n}].")
-        if positions.shape != (n, self.position_dim) or not np.issubdtype(
-            positions.dtype, np.floating
-        ):
+        if positions.shape != (n, self.position_dim) or positions.dtype.kind != "f":
             raise ValueError(
                 f"positions are {positions.dtype}{list(positions.shape)}; they must be "
                 f"float[{n}, {self.position_dim}]."

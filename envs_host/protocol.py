@@ -128,7 +128,7 @@ class GymnasiumHost:
     def step(self, action_id: int, position: np.ndarray) -> Step:
         action: Any = action_id
         if self._id_key is not None:
-            position = position.astype(self._position_dtype)
+            position = position.astype(self._position_dtype, copy=False)
             action = {self._id_key: action_id, self._position_key: position}
         observation, reward, terminated, truncated, info = self._env.step(action)
         return Step(
@@ -140,6 +140,8 @@ class GymnasiumHost:
         )
 
     def _metrics(self, info: Mapping[str, Any], is_end: bool) -> Metrics:
+        if not self.episode_metrics:
+            return {}
         absent = [name for name in self.episode_metrics if name not in info]
         if absent and is_end:
             raise ValueError(

@@ -63,6 +63,8 @@ class Host:
                 self._environments[i] = make(**self._setup.kwargs)
         self.environment = None
         self.format = self._common_format()
+        self._shape = self.format.observation_shape
+        self._dtype = np.dtype(self.format.observation_dtype)
         self._metric_names = frozenset(self.format.episode_metrics)
 
     def _common_format(self) -> Format:
@@ -107,25 +109,33 @@ class Host:
         self.activity = f"stepped half {half}"
         arrays, names = self._arrays, self.format.episode_metrics
         first, end = self._setup.halves[half]
-        for i, action_id in zip(range(first, end), arrays.ids[first:end].tolist(), strict=True):
+        rewards, terminations, truncations, rows = [], [], [], []
+        actions = zip(
+            arrays.ids[first:end].tolist(), arrays.positions[first:end].copy(), strict=True
+        )
+        for i, (action_id, position) in enumerate(actions, first):
             self.environment = i
             observation, reward, terminated, truncated, metrics = self._environments[i].step(
-                action_id, arrays.positions[i].copy()
+                action_id, position
             )
             observation = self._checked(observation)
             arrays.final_observations[i] = observation
-            arrays.rewards[i] = reward
-            arrays.terminated[i] = terminated
-            arrays.truncated[i] = truncated
             if metrics.keys() != self._metric_names:
                 raise ProtocolError(
                     f"The metrics of a step are {sorted(metrics)}; episode_metrics says {names}."
                 )
-            arrays.metrics[i] = [metrics[name] for name in names]
+            rewards.append(float(reward))
+            terminations.append(bool(terminated))
+            truncations.append(bool(truncated))
+            rows.append([float(metrics[name]) for name in names])
             if terminated or truncated:
                 observation = self._checked(self._reset(i, int(arrays.episodes[i]) + 1))
             arrays.observations[i] = observation
         self.environment = None
+        arrays.rewards[first:end] = rewards
+        arrays.terminated[first:end] = terminations
+        arrays.truncated[first:end] = truncations
+        arrays.metrics[first:end] = rows
 
     def _reset(self, i: int, episode: int) -> Any:
         return self._environments[i].reset(episode_seed(self._seed, i, episode))
@@ -137,12 +147,10 @@ class Host:
           ProtocolError: it is not what the environment declares.
         """
         array = np.asarray(observation)
-        if array.shape != self.format.observation_shape or array.dtype != np.dtype(
-            self.format.observation_dtype
-        ):
+        if array.shape != self._shape or array.dtype != self._dtype:
             raise ProtocolError(
                 f"An observation is {array.dtype}{list(array.shape)}; the environment declares "
-                f"{self.format.observation_dtype}{list(self.format.observation_shape)}."
+                f"{self._dtype}{list(self._shape)}."
             )
         return array
 

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import sys
 import time
 
@@ -23,6 +24,8 @@ from tests.envs_host.pool_toys import FAULTY
 
 
 def main(kind: str) -> None:
+    # Where the tests themselves run in a shell's background, Ctrl-C is ignored from the start.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     pool = HostPool(FAULTY, {"fault": "hang"}, 4, 2, 0)
     if kind == "bare":
         step_for_ever(pool, [])

@@ -93,7 +93,8 @@ class Broken(Chaotic):
     """Is not what it declares.
 
     Args:
-      how: shape, dtype or metrics, of its steps; int64 or differing, of its declaration.
+      how: shape, dtype or metrics, of its steps; int64 or differing, of its declaration,
+        or process: it declares something else in every process.
     """
 
     num_made = 0
@@ -105,6 +106,8 @@ class Broken(Chaotic):
             self.observation_dtype = np.int64
         if how == "differing":
             self.position_dim = Broken.num_made
+        if how == "process":
+            self.position_dim = os.getpid() % 1000
 
     def step(self, action_id: int, position: np.ndarray) -> Any:
         observation, *others, metrics = super().step(action_id, position)
@@ -118,7 +121,7 @@ class Broken(Chaotic):
 
 
 class Spy(Chaotic):
-    """Tells about its process, and prints."""
+    """Tells about its process, and prints what is done to it."""
 
     position_dim = 0
     episode_metrics = ("has_jax", "ignores_sigint", "num_threads", "num_cores", "pid")
@@ -137,8 +140,12 @@ class Spy(Chaotic):
         }
         return observation, reward, terminated, truncated, metrics
 
+    def close(self) -> None:
+        print("closed")
+
 
 def misbehave(fault: str) -> None:
+    print(f"about to {fault}")
     if fault == "raise":
         raise ZeroDivisionError("a fault in the physics")
     if fault == "exit":

@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import os
+import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from envs_host import pool as pool_module
 from envs_host.pool import HostPool, HostStep, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, NAME, Chaotic
 
@@ -133,6 +138,21 @@ def test_a_half_may_run_ahead() -> None:
                 assert_same(found, {name: expected[name][t, rows] for name in found})
 
 
+@pytest.mark.property
+@given(st.integers(1, 6), st.integers(1, 20), st.data())
+def test_workers_share_every_half_evenly(num_halves: int, size: int, data: st.DataObject) -> None:
+    num_workers = data.draw(st.integers(1, size))
+    setups = pool_module._setups("", {}, num_halves * size, num_workers, num_halves, False)
+    for half in range(num_halves):
+        held = [list(range(*setup.halves[half])) for setup in setups]
+        together = [i for environments in held for i in environments]
+        assert together == list(range(half * size, (half + 1) * size))
+        assert {len(environments) for environments in held} <= {
+            size // num_workers,
+            -(-size // num_workers),
+        }
+
+
 @pytest.mark.unit
 def test_a_second_reset_starts_the_next_episodes() -> None:
     with HostPool(CHAOTIC, {}, 4, 2, SEED) as pool:
@@ -143,6 +163,7 @@ def test_a_second_reset_starts_the_next_episodes() -> None:
                 seed = np.random.SeedSequence(SEED, spawn_key=(i, episode))
                 np.testing.assert_array_equal(found[i], Chaotic().reset(seed))
             np.testing.assert_array_equal(pool.episodes, episode)
+            pool.step(np.zeros(4, int), np.zeros((4, 2)))
 
 
 @pytest.mark.unit
@@ -176,8 +197,16 @@ def test_what_the_environments_are() -> None:
         assert len(set(pool.worker_pids)) == 2
 
 
+@pytest.fixture
+def ctrl_c_raises() -> Iterator[None]:
+    """Also where the tests run in a shell's background, so that it is ignored from the start."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
 @pytest.mark.integration
-def test_workers_have_no_jax_one_thread_and_no_ctrl_c() -> None:
+def test_workers_have_no_jax_one_thread_and_no_ctrl_c(ctrl_c_raises: None) -> None:
     import jax
 
     assert jax.__name__ in sys.modules
@@ -203,7 +232,7 @@ def test_pinned_workers_keep_to_one_core_each() -> None:
 
 
 @pytest.mark.integration
-def test_what_workers_print_is_on_stderr() -> None:
+def test_what_workers_print_is_on_stderr_until_environments_are_closed() -> None:
     script = (
         "import numpy as np; from envs_host.pool import HostPool\n"
         f"with HostPool('{NAME}:Spy', {{}}, 4, 2, 0) as pool:\n"
@@ -214,7 +243,9 @@ def test_what_workers_print_is_on_stderr() -> None:
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout == "printed by the parent\n"
-    assert sorted(done.stderr.splitlines()) == [f"printed by {i}" for i in range(4)]
+    lines = done.stderr.splitlines()
+    assert sorted(lines[:4]) == [f"printed by {i}" for i in range(4)]
+    assert lines[4:] == ["closed"] * 4
 
 
 @pytest.mark.integration
@@ -278,6 +309,12 @@ def test_a_factory_that_does_not_work(factory: str, kwargs: dict[str, Any], mess
     assert caught.value.worker == 0
     assert caught.value.environments == (0, 1, 2, 3)
     assert "Traceback" in caught.value.traceback
+
+
+@pytest.mark.unit
+def test_workers_that_make_different_environments() -> None:
+    with pytest.raises(ValueError, match="The workers made different environments"):
+        HostPool(f"{NAME}:Broken", {"how": "process"}, 4, 2, 0)
 
 
 @pytest.mark.unit

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from envs_host import _process
+from envs_host._memory import Setup
 from envs_host.pool import HostPool, ReplayMismatch, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, FAULTY, NAME
 
@@ -73,7 +74,9 @@ def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
         ("SIGSTOP", "gave no answer in 3 s", ""),
     ],
 )
-def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, detail: str) -> None:
+def test_a_fault_is_reported_with_all_that_is_known(
+    fault: str, reason: str, detail: str, capfd: pytest.CaptureFixture[str]
+) -> None:
     hangs = fault in ("hang", "SIGSTOP")
     timeout_s = TIMEOUT_S if hangs else 60.0
     with HostPool(FAULTY, {"fault": fault}, NUM_ENVS, 2, SEED, timeout_s=timeout_s) as pool:
@@ -89,6 +92,7 @@ def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, det
         with pytest.raises(RuntimeError, match="The pool is closed: worker 1 was lost"):
             pool.reset()
     error = caught.value
+    assert capfd.readouterr() == ("", f"about to {fault}\n")  # Printed before the end, not lost.
     assert error.worker == 1
     assert error.environments == (1, 3)
     assert error.seeds == tuple((SEED, (i, int(state["episodes"][i]))) for i in (1, 3))
@@ -106,7 +110,7 @@ def test_a_fault_is_reported_with_all_that_is_known(fault: str, reason: str, det
 
 
 @pytest.mark.integration
-def test_a_state_after_a_loss_is_that_of_the_last_step(tmp_path: Path) -> None:
+def test_a_state_after_a_loss_is_that_of_the_last_step() -> None:
     bad = (5, 1)  # In half 0, so neither half is received.
     expected, steps = undisturbed(bad), actions(bad)
     with HostPool(FAULTY, {"fault": "SIGKILL"}, NUM_ENVS, 2, SEED) as pool:
@@ -217,6 +221,48 @@ def test_a_replacement_that_differs_is_refused() -> None:
             pool.receive(0)
         with pytest.raises(RuntimeError, match="replaying its actions led elsewhere"):
             pool.reset()
+
+
+@pytest.mark.integration
+def test_a_replacement_of_another_kind_is_refused() -> None:
+    factory = f"{NAME}:Broken"
+    with HostPool(
+        factory, {"how": "process"}, 2, 1, 0, on_worker_death="restart", max_restarts=2
+    ) as pool:
+        end_of(pool.worker_pids[0])
+        with pytest.raises(WorkerError, match="came back with other environments: Format") as error:
+            pool.reset()
+        assert error.value.worker == 0
+
+
+@pytest.mark.integration
+def test_a_worker_that_does_not_read_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its socket cannot hold the actions that it is to replay."""
+    num_steps = 20_000
+    with HostPool(CHAOTIC, {}, 2, 1, 0, timeout_s=TIMEOUT_S) as pool:
+        pool.reset()
+        state = pool.state_dict(num_steps)
+        state["lengths"][:] = num_steps
+        # Known from sending: waiting for an answer as well would take twice the timeout.
+        monkeypatch.setattr(_process.WorkerProcess, "read", None)
+        os.kill(pool.worker_pids[0], signal.SIGSTOP)
+        with pytest.raises(WorkerError, match="gave no answer in 3 s"):
+            pool.load_state(state)
+
+
+@pytest.mark.integration
+def test_a_worker_that_is_just_starting_ignores_ctrl_c_and_is_started_once() -> None:
+    worker = _process.WorkerProcess(Setup(CHAOTIC, {}, 1, ((0, 1),), None))
+    try:
+        worker.start()
+        first = worker.pid
+        worker.start()
+        os.kill(worker.pid, signal.SIGINT)  # Long before Python can run a line of it.
+        with pytest.raises(ProcessLookupError):
+            os.kill(first, 0)
+        assert worker.read(60.0)[1].position_dim == 2
+    finally:
+        worker.stop(grace_s=0.0)
 
 
 @pytest.mark.integration
