@@ -24,10 +24,10 @@ LAYERS = (
     {"sampling", "environment"},
     {"policy", "representation"},
     {"rollout", "ppo"},
-    {"loop", "evaluation"},
+    {"loop", "evaluation", "host_evaluation"},
     {"task"},
 )
-SIDEWAYS = {("ppo", "rollout")}
+SIDEWAYS = {("ppo", "rollout"), ("host_evaluation", "evaluation")}
 
 HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
