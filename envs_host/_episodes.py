@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from envs_host._log import ActionLog
-from envs_host._memory import Restore
+from envs_host._memory import Restore, episode_key
 
 STATE_KEYS = ("seed", "episodes", "observation_crc", "lengths", "ids", "positions")
 
@@ -18,13 +18,14 @@ class Episodes:
 
     Attributes:
       seed: of the pool.
+      is_numbered: whether episodes are seeded by their number in the pool, see `episode_key`.
       numbers: int64[N] of the running episodes, -1 before the first; in shared memory once the
         workers have it.
       log: of the running episodes.
     """
 
     def __init__(self, seed: int, num_envs: int) -> None:
-        self.seed = seed
+        self.seed, self.is_numbered = seed, False
         self.numbers = np.full(num_envs, -1, np.int64)
         self.log: ActionLog
 
@@ -43,6 +44,12 @@ class Episodes:
         self.numbers += 1
         self.log.clear(np.arange(len(self.numbers)))
 
+    def begin_numbered(self, seed: int) -> None:
+        """Moves every environment to its first numbered episode of another seed."""
+        self.seed, self.is_numbered = seed, True
+        self.numbers[:] = -1
+        self.begin_next()
+
     def act(self, rows: slice, ids: np.ndarray, positions: np.ndarray, is_end: np.ndarray) -> None:
         """Notes a decision in the environments of `rows`, and that episodes ended with it."""
         self.log.append(rows, ids, positions)
@@ -52,11 +59,15 @@ class Episodes:
 
     def restore(self, environments: Iterable[int]) -> Restore:
         """What a worker needs to bring these environments here."""
-        return Restore(self.seed, {i: self.log.of(i) for i in environments})
+        return Restore(self.seed, self.is_numbered, {i: self.log.of(i) for i in environments})
 
-    def seeds(self, environments: Iterable[int]) -> tuple[tuple[int, tuple[int, int]], ...]:
+    def seeds(self, environments: Iterable[int]) -> tuple[tuple[int, tuple[int, ...]], ...]:
         """(seed, spawn key) of the running episodes."""
-        return tuple((self.seed, (i, max(int(self.numbers[i]), 0))) for i in environments)
+        numbers, num_envs = np.maximum(self.numbers, 0).tolist(), len(self.numbers)
+        return tuple(
+            (self.seed, episode_key(i, numbers[i], num_envs, self.is_numbered))
+            for i in environments
+        )
 
     def state(self, num_steps: int | None) -> dict[str, np.ndarray]:
         return {
@@ -97,6 +108,6 @@ class Episodes:
                 f"The state is damaged: lengths must be 0 .. {num_steps} and episodes at least 0; "
                 f"got lengths {lengths} and episodes {arrays['episodes']}."
             )
-        self.seed = int(arrays["seed"])
+        self.seed, self.is_numbered = int(arrays["seed"]), False
         self.numbers[:] = arrays["episodes"]
         self.log.load(lengths, arrays["ids"], arrays["positions"])

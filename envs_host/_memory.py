@@ -45,11 +45,13 @@ class Restore(NamedTuple):
 
     Attributes:
       seed: of the pool.
+      is_numbered: see `episode_key`.
       logs: {environment: (ids int32[L], positions f32[L, k])}, the actions of its running episode;
         the episode's number is in the shared memory.
     """
 
     seed: int
+    is_numbered: bool
     logs: dict[int, tuple[np.ndarray, np.ndarray]]
 
 
@@ -67,9 +69,15 @@ class Failure(NamedTuple):
     traceback: str
 
 
-def episode_seed(seed: int, environment: int, episode: int) -> np.random.SeedSequence:
-    """The seed of one episode of one environment."""
-    return np.random.SeedSequence(seed, spawn_key=(environment, episode))
+def episode_key(
+    environment: int, episode: int, num_envs: int, is_numbered: bool
+) -> tuple[int, ...]:
+    """The spawn key that, with the pool's seed, is the seed of an environment's episode.
+
+    Numbered episodes are those of an evaluation: the n-th of all has the same seed in pools of any
+    size, since environment i of N plays the episodes i, i + N, ...
+    """
+    return (episode * num_envs + environment,) if is_numbered else (environment, episode)
 
 
 @dataclass(frozen=True)

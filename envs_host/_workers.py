@@ -32,7 +32,7 @@ class WorkerError(RuntimeError):
     """
 
     def __init__(
-        self, worker: int, seeds: tuple[tuple[int, tuple[int, int]], ...], lost: Lost
+        self, worker: int, seeds: tuple[tuple[int, tuple[int, ...]], ...], lost: Lost
     ) -> None:
         self.worker, self.seeds, self.reason = worker, seeds, str(lost)
         self.environments = tuple(key[0] for _, key in seeds)

@@ -159,6 +159,25 @@ class HostPool:
         self._workers.restore()
         return self._observations[:]
 
+    def reset_numbered(self, seed: int) -> np.ndarray:
+        """Starts an evaluation: environment i of N plays the episodes i, i + N, ... of a seed.
+
+        Episode n is seeded with `SeedSequence(seed, spawn_key=(n,))`, so that it is the same in
+        pools of any size. Whatever ran is given up; `load_state` brings it back, and there is no
+        state of an evaluation.
+
+        Args:
+          seed: 0 .. 2^63 - 1, in place of the pool's own.
+
+        Returns:
+          Observations [N, ...], as `reset`.
+        """
+        self._check_idle()
+        _check_seed(seed)
+        self._episodes.begin_numbered(seed)
+        self._workers.restore()
+        return _read_only(self._arrays.observations)
+
     def send(self, half: int, ids: np.ndarray, positions: np.ndarray | None = None) -> None:
         """Has the workers do one decision in a half; they start at once.
 
@@ -238,6 +257,8 @@ class HostPool:
           int32[L, N], positions f32[L, N, k].
         """
         self._check_begun(may_be_closed=True)
+        if self._episodes.is_numbered:
+            raise RuntimeError("An evaluation has no state; load_state or a new pool goes on.")
         if self._workers.in_flight and not self._workers.why_closed:
             raise RuntimeError(f"Halves {self._workers.in_flight} are running; receive them first.")
         return {
@@ -340,10 +361,14 @@ def _check_arguments(
             f"num_workers={num_workers} must be 1 .. {num_envs // num_halves}, so that each has "
             "environments of every half."
         )
-    if not 0 <= seed < 2**63:
-        raise ValueError(f"seed={seed} must be 0 .. 2^63 - 1.")
+    _check_seed(seed)
     if on_worker_death not in ("raise", "restart"):
         raise ValueError(f"on_worker_death={on_worker_death!r} must be 'raise' or 'restart'.")
+
+
+def _check_seed(seed: int) -> None:
+    if not 0 <= seed < 2**63:
+        raise ValueError(f"seed={seed} must be 0 .. 2^63 - 1.")
 
 
 def _setups(

@@ -24,7 +24,7 @@ import numpy as np
 
 from envs_host import _channel as codes
 from envs_host._channel import Channel, HungUp
-from envs_host._memory import Failure, Format, Restore, Setup, SharedArrays, episode_seed
+from envs_host._memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
 from envs_host.protocol import HostEnvironment, load_factory
 
 # A worker in the middle of a step gets this long to finish once the pool's process is gone.
@@ -49,7 +49,7 @@ class Host:
         self.activity = "started"
         self.format: Format
         self._setup = setup
-        self._seed = 0
+        self._seed, self._is_numbered = 0, False
         self._arrays: SharedArrays
         self._environments: dict[int, HostEnvironment] = {}
 
@@ -85,7 +85,8 @@ class Host:
 
     def restore(self, restore: Restore, tell_progress: Callable[[], None]) -> None:
         """Starts the environments' running episodes and replays what happened in them."""
-        self.activity, self._seed = "restored environments", restore.seed
+        self.activity = "restored environments"
+        self._seed, self._is_numbered = restore.seed, restore.is_numbered
         for i, (ids, positions) in restore.logs.items():
             self.environment = i
             observation = self._reset(i, int(self._arrays.episodes[i]))
@@ -138,7 +139,8 @@ class Host:
         arrays.metrics[first:end] = rows
 
     def _reset(self, i: int, episode: int) -> Any:
-        return self._environments[i].reset(episode_seed(self._seed, i, episode))
+        key = episode_key(i, episode, self._setup.num_envs, self._is_numbered)
+        return self._environments[i].reset(np.random.SeedSequence(self._seed, spawn_key=key))
 
     def _checked(self, observation: Any) -> np.ndarray:
         """The observation; assigning one of another shape would broadcast, of another dtype cast.

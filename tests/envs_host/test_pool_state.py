@@ -193,3 +193,48 @@ def test_the_log_is_a_list_per_environment(steps: list[tuple[bool, int]], k: int
             assert positions.shape == (len(expected), k)
             assert positions.dtype == np.float32
             np.testing.assert_array_equal(positions, (ids % 100)[:, None].repeat(k, 1))
+
+
+def numbered_episodes(pool: HostPool, num_episodes: int) -> list[list[float]]:
+    """The rewards of the first episodes of an evaluation whose actions are their episode's."""
+    pool.reset_numbered(7)
+    rewards: list[list[float]] = [[] for _ in range(num_episodes + 64)]
+    number = np.arange(pool.num_envs)
+    while number.min() < num_episodes:
+        t = np.array([len(rewards[n]) for n in number])
+        ids = (3 * number + t) % 10
+        positions = np.stack([np.sin(number + t), np.cos(number - t)], axis=1).astype(np.float32)
+        step = pool.step(ids.astype(np.int32), positions)
+        for i, n in enumerate(number):
+            rewards[n].append(float(step.rewards[i]))
+        number = number + np.where(step.terminated | step.truncated, pool.num_envs, 0)
+        number = np.minimum(number, len(rewards) - 1)
+    return rewards[:num_episodes]
+
+
+@pytest.mark.integration
+def test_numbered_episodes_are_the_same_in_pools_of_any_size() -> None:
+    played = []
+    for num_envs, num_workers, num_halves in ((8, 2, 2), (3, 1, 1)):
+        with HostPool(CHAOTIC, {}, num_envs, num_workers, SEED, num_halves=num_halves) as pool:
+            played.append(numbered_episodes(pool, 16))
+    assert played[0] == played[1]
+    assert len({tuple(rewards) for rewards in played[0]}) == 16
+    assert min(len(rewards) for rewards in played[0]) < max(len(rewards) for rewards in played[0])
+
+
+@pytest.mark.integration
+def test_an_evaluation_has_no_state_and_training_goes_on_after_it() -> None:
+    with pool_of() as pool:
+        pool.reset()
+        play(pool, range(10))
+        state = pool.state_dict()
+        expected = play(pool, range(10, 20))
+        pool.reset_numbered(3)
+        play(pool, range(5))
+        with pytest.raises(RuntimeError, match="An evaluation has no state"):
+            pool.state_dict()
+        pool.load_state(state)
+        for x, y in zip(play(pool, range(10, 20)), expected, strict=True):
+            np.testing.assert_array_equal(x, y)
+        assert pool.seed == SEED
