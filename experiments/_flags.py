@@ -34,6 +34,9 @@ SEED = flags.DEFINE_integer("seed", 31, "Seed of the run.")
 WORKDIR = flags.DEFINE_string("workdir", None, "Directory of the run; default: below --runs.")
 RUNS = flags.DEFINE_string("runs", "runs", "Where runs and what they share are kept.")
 OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an existing run instead of resuming.")
+WORKERS = flags.DEFINE_integer(
+    "workers", 0, "Processes for environments on the host; 0: one per core.", lower_bound=0
+)
 SET = flags.DEFINE_multi_string("set", [], "path.to.field=value, for any field of the config.")
 DEBUG_NANS = flags.DEFINE_bool("debug_nans", False, "Stop at the operation that makes a NaN.")
 

@@ -94,7 +94,7 @@ def _unseen_ratio(context: Context, value: float) -> Condition:
 def _growing_set(context: Context, value: float) -> Condition:
     trainer, split, _ = context
     size = trainer.config.ppo.rollout.set_size
-    steps = trainer.evaluator.env.max_episode_steps(trainer.evaluator.env_params)
+    steps = trainer.evaluator.max_episode_steps
     growth = -(-(size - int(value)) // max(1, steps - 1))  # Complete at the last step.
     options = {"set_size": size, "first_size": int(value), "growth": growth}
     return Condition("test", split.test, options if value < size else {"set_size": size})

@@ -49,6 +49,11 @@ class Evaluator:
     def __post_init__(self) -> None:
         check_growth(self.first_size, self.growth, self.set_size)
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Length of the longest episode."""
+        return self.env.max_episode_steps(self.env_params)
+
     def run(
         self,
         params: Any,
@@ -131,8 +136,7 @@ class Evaluator:
         names = (*self.env.episode_metrics, "num_steps")
         zeros = {name: jnp.zeros(self.width) for name in names}
         carry = (obs, state, jnp.zeros(self.width, bool), zeros)
-        num_steps = self.env.max_episode_steps(self.env_params)
-        (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(num_steps))
+        (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(self.max_episode_steps))
         return metrics
 
     def _available_at(self, available: AvailableSet, t: jax.Array) -> AvailableSet:

@@ -43,6 +43,11 @@ class HostEvaluator:
     def __post_init__(self) -> None:
         check_growth(self.first_size, self.growth, self.set_size)
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Length of the longest episode."""
+        return self.environments.max_episode_steps
+
     def run(
         self,
         params: Any,
