@@ -70,7 +70,7 @@ def draw(
         raise ValueError(f"size={size} must be at least 1 pixel.")
     if mode == "gray":
         return _paint(sprites, size, _GRAYS, column=1)
-    return RGB_OF_INK[_paint(sprites, size, _INKS, column=2)]
+    return np.take(RGB_OF_INK, _paint(sprites, size, _INKS, column=2), axis=0)
 
 
 def _paint(
@@ -83,8 +83,7 @@ def _paint(
         if kind is Kind.DISC:
             frame[_disc_places(sprite, size)] = value_of[INK_OF_TONE[sprite.tone]]
         elif kind is Kind.PLANK:
-            places = _places(raster.line(*_ends(sprite, size)), size)
-            frame[places] = value_of[INK_OF_TONE[sprite.tone]]
+            frame[_plank_places(sprite, size)] = value_of[INK_OF_TONE[sprite.tone]]
         else:
             form = _turning_print(sprite, size) if kind in _TURNING else _print(sprite, size)
             frame[form.places] = form[column]
@@ -116,6 +115,21 @@ def _disc_offsets(radius: int, size: int) -> np.ndarray:
 @lru_cache(maxsize=256)
 def _disc(radius: int) -> np.ndarray:
     return raster.disc(radius)
+
+
+def _plank_places(sprite: Sprite, size: int) -> np.ndarray:
+    """Where a plank is; quick for one that is wholly in the picture."""
+    start, end = _ends(sprite, size)
+    rise, run = end[0] - start[0], end[1] - start[1]
+    if min(*start, *end) >= 0 and max(*start, *end) < size:
+        return _line_offsets(rise, run, size) + ((start[0] + 1) * size - 1 - start[1])
+    return _places(raster.line(start, end), size)
+
+
+@lru_cache(maxsize=4096)
+def _line_offsets(rise: int, run: int, size: int) -> np.ndarray:
+    pixels = raster.line((0, 0), (rise, run))
+    return pixels[:, 0] * size - pixels[:, 1]
 
 
 def _places(pixels: np.ndarray, size: int) -> np.ndarray:
