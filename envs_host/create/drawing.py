@@ -103,7 +103,7 @@ def _disc_places(sprite: Sprite, size: int) -> np.ndarray:
     reach = max(radius, 1)
     if reach <= row <= size - reach and reach <= column <= size - reach:
         return _disc_offsets(radius, size) + ((row + 1) * size - 1 - column)
-    return _places(_disc(radius) + (row, column), size)
+    return _places(_disc(radius) + np.array([row, column]), size)
 
 
 @lru_cache(maxsize=256)
@@ -139,7 +139,7 @@ def _places(pixels: np.ndarray, size: int) -> np.ndarray:
 
 
 def _is_inside(pixels: np.ndarray, size: int) -> np.ndarray:
-    return ((pixels >= 0) & (pixels < size)).all(axis=1)
+    return np.logical_and(pixels >= 0, pixels < size).all(axis=1)
 
 
 def _turning_print(sprite: Sprite, size: int) -> _Print:
@@ -175,18 +175,19 @@ def _cut(form: Glyph, size: int) -> _Print:
 def _solid(sprite: Sprite, size: int) -> np.ndarray:
     """Pixels of what has one tone and stands still."""
     scale = size / WORLD_SIZE
-    row, column = _centre(sprite, size)
+    centre = np.array(_centre(sprite, size))
     if sprite.kind is Kind.BAR:
         width = max(1, int(math.floor(sprite.width) * scale))
         return raster.line(*_ends(sprite, size), width)
     if sprite.kind is Kind.PIVOT:
         half, height = int(sprite.size * scale / 2.0), max(1, int(sprite.width * scale))
+        row, column = _centre(sprite, size)
         foot = row + height
         return raster.polygon([(row, column), (foot, column - half), (foot, column + half)])
     if sprite.kind is Kind.STAR:
-        return raster.star(sprite.size * scale) + (row, column)
+        return raster.star(sprite.size * scale) + centre
     if sprite.kind is Kind.SUBGOAL:
-        return _disc(int(sprite.size * scale)) + (row, column)
+        return _disc(int(sprite.size * scale)) + centre
     assert sprite.kind is Kind.POLYGON, sprite.kind
     angles = [sprite.angle + 2.0 * math.pi * k / sprite.sides for k in range(sprite.sides)]
     return raster.polygon([_pixel(sprite, size, sprite.size, angle) for angle in angles])

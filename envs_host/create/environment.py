@@ -22,7 +22,7 @@ from envs_host.create.tools import Tool, all_tools
 from envs_host.create.world import Placement, World
 
 if TYPE_CHECKING:
-    from envs_host.create.films import RenderOptions
+    from envs_host.create.illustration import RenderOptions
 
 _DRAWING = "envs_host.create.drawing"
 _FILMS = "envs_host.create.films"
@@ -190,7 +190,7 @@ class CreateEnv(gymnasium.Env):
         """uint8[size, size, 3] picture for people, if the render mode is "rgb_array"."""
         if self._films is None:
             return None
-        options = self._render_options or self._films.RenderOptions()
+        options = self._render_options or self._films.DEFAULT_OPTIONS
         return self._films.picture(self.world, self._trail, self.episode.summary, options)
 
     def _show(self, world: World) -> None:

@@ -3,38 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from envs_host.create.episode import Summary
 from envs_host.create.geometry import Point
-from envs_host.create.illustration import Trace, illustrate
+from envs_host.create.illustration import RenderOptions, Trace, illustrate
 from envs_host.create.sprites import Tone
 from envs_host.create.world import World
 
 if TYPE_CHECKING:
     from envs_host.create.environment import CreateEnv
 
+DEFAULT_OPTIONS = RenderOptions()
 _FILM_SIZE = 512
-
-
-@dataclass(frozen=True)
-class RenderOptions:
-    """How an episode is shown to people.
-
-    Attributes:
-      size: pixels of the side.
-      with_text: whether action number and return are written into the picture.
-      with_traces: whether the ways of target and marker are drawn.
-      with_tint: whether the ground changes its colour after success.
-    """
-
-    size: int = 1024
-    with_text: bool = True
-    with_traces: bool = True
-    with_tint: bool = True
 
 
 class Trail:

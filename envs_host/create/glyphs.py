@@ -89,7 +89,7 @@ def _trampoline(sprite: Sprite, scale: float) -> Glyph:
 
 
 def _cannon(sprite: Sprite, scale: float) -> Glyph:
-    """A barrel with rings, turned by the aim and then squeezed into a box that is always the same."""
+    """A barrel with rings, turned by the aim and squeezed into a box that is always the same."""
     cos, sin = math.cos(sprite.angle), math.sin(sprite.angle)
     length, width = _BARREL
     pixels, x, y = _sample(max(_CANNON_BOX), scale, 0.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,23 @@ INK: Color = (45, 52, 64)
 _SMALLEST = 16
 _TEXT_SHARE = 0.034
 _TRACE_WIDTH = 0.45
+
+
+@dataclass(frozen=True)
+class RenderOptions:
+    """How an episode is shown to people.
+
+    Attributes:
+      size: pixels of the side.
+      with_text: whether action number and return are written into the picture.
+      with_traces: whether the ways of target and marker are drawn.
+      with_tint: whether the ground changes its colour after success.
+    """
+
+    size: int = 1024
+    with_text: bool = True
+    with_traces: bool = True
+    with_tint: bool = True
 
 
 class Trace(NamedTuple):

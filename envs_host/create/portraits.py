@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable
 
@@ -191,7 +192,7 @@ def _ladder(pen: Pen, sprite: Sprite) -> None:
 def _basket(pen: Pen, sprite: Sprite) -> None:
     half = sprite.size / 2.0
     strands = (-1.0, -0.5, 0.0, 0.5, 1.0)
-    for near, far in zip(strands[:-1], strands[1:], strict=True):
+    for near, far in itertools.pairwise(strands):
         pen.line([(near * half, half), (0.6 * far * half, -half)], NET, 0.3)
         pen.line([(far * half, half), (0.6 * near * half, -half)], NET, 0.3)
     for side in (-1.0, 1.0):
