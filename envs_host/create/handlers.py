@@ -9,14 +9,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import TYPE_CHECKING
+from typing import Any
 
 import pymunk
-
-if TYPE_CHECKING:
-    from envs_host.create.stage import Stage
 
 Point = tuple[float, float]
 
@@ -83,39 +80,60 @@ class PlankLaw:
 
 
 Law = CannonLaw | FanLaw | ConveyorLaw | FunnelLaw | BucketLaw | PlankLaw
-Callback = Callable[[pymunk.Arbiter, pymunk.Space, "Stage"], None]
 
 
-def fire(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+@dataclass
+class Ledger:
+    """What callbacks need to know and to remember about the shapes of one space.
+
+    Attributes:
+      zeroes_velocity: whether buckets zero the velocity of what they hold on every substep.
+      laws: what the shape of a tool does to moving objects.
+      caught: shapes that a bucket has caught; the mark is never cleared (2.7).
+      met: pairs of shapes that have begun to touch: goal with moving, moving with moving.
+      inside: (moving, subgoal) shapes that touch now.
+    """
+
+    zeroes_velocity: bool = False
+    laws: dict[pymunk.Shape, Any] = field(default_factory=dict)  # Any: each type has its own law.
+    caught: set[pymunk.Shape] = field(default_factory=set)
+    met: set[frozenset[pymunk.Shape]] = field(default_factory=set)
+    inside: set[tuple[pymunk.Shape, pymunk.Shape]] = field(default_factory=set)
+
+
+Callback = Callable[[pymunk.Arbiter, pymunk.Space, Ledger], None]
+
+
+def fire(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Cannon: what enters the region is put at the muzzle and shot (spec create 2.4)."""
     shape, region = arbiter.shapes
-    law = stage.laws[region]
+    law = ledger.laws[region]
     put_to_rest(shape.body, law.muzzle)
     shape.body.apply_impulse_at_local_point(law.impulse)
 
 
-def blow(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def blow(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Fan: a force in the frame of the object, which turns as it rolls (2.5, A5)."""
     shape, region = arbiter.shapes
-    shape.body.apply_force_at_local_point(stage.laws[region].force)
+    shape.body.apply_force_at_local_point(ledger.laws[region].force)
 
 
-def blow_in_world_frame(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def blow_in_world_frame(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Fan: a force in the frame of the world (2.5, the stand-alone release)."""
     shape, region = arbiter.shapes
-    shape.body.apply_force_at_world_point(stage.laws[region].force, shape.body.position)
+    shape.body.apply_force_at_world_point(ledger.laws[region].force, shape.body.position)
 
 
-def carry(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def carry(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Belt and ladder: the velocity is overwritten (2.6)."""
     shape, region = arbiter.shapes
-    shape.body.velocity = stage.laws[region].velocity
+    shape.body.velocity = ledger.laws[region].velocity
 
 
-def catch_in_funnel(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def catch_in_funnel(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Funnel: from above, through to the tip; else an ordinary block (2.7)."""
     shape, block = arbiter.shapes
-    law = stage.laws[block]
+    law = ledger.laws[block]
     centre = shape.body.position
     to_tip = math.dist(centre, law.tip)
     is_above = all(to_tip > math.dist(centre, corner) for corner in law.upper)
@@ -124,16 +142,16 @@ def catch_in_funnel(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) 
     arbiter.process_collision = not is_above
 
 
-def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Bucket: from above, held in its centre for good; else an ordinary block (2.7).
 
     Only the position of what is held is reset, so gravity keeps adding to its velocity (A6).
     """
     shape, block = arbiter.shapes
-    law = stage.laws[block]
-    if shape in stage.caught:
+    law = ledger.laws[block]
+    if shape in ledger.caught:
         shape.body.position = law.centre
-        if stage.physics.bucket_zeroes_velocity:
+        if ledger.zeroes_velocity:
             shape.body.velocity = 0.0, 0.0
         arbiter.process_collision = False
         return
@@ -142,15 +160,15 @@ def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) 
     is_above = all(math.dist(centre, corner) < nearest_lower for corner in law.upper)
     if is_above:
         put_to_rest(shape.body, law.centre)
-        stage.caught.add(shape)
+        ledger.caught.add(shape)
     arbiter.process_collision = not is_above
 
 
-def damp(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def damp(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Plank: slows balls, and only balls, after the solver (2.8)."""
     shape, plank = arbiter.shapes
     if isinstance(shape, pymunk.Circle):
-        factor = stage.laws[plank].damping
+        factor = ledger.laws[plank].damping
         shape.body.velocity *= factor
         shape.body.angular_velocity *= factor
 
@@ -165,15 +183,15 @@ def put_to_rest(body: pymunk.Body, position: Point) -> None:
     body.angle = 0.0
 
 
-def enter_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def enter_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Keeps account of who is in which subgoal disc now (6.5)."""
-    stage.inside.add(arbiter.shapes)
+    ledger.inside.add(arbiter.shapes)
 
 
-def leave_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
-    stage.inside.discard(arbiter.shapes)
+def leave_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
+    ledger.inside.discard(arbiter.shapes)
 
 
-def meet(arbiter: pymunk.Arbiter, space: pymunk.Space, stage: Stage) -> None:
+def meet(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
     """Remembers which objects have ever begun to touch (6.2, 6.4)."""
-    stage.met.add(frozenset(arbiter.shapes))
+    ledger.met.add(frozenset(arbiter.shapes))

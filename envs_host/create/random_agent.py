@@ -115,8 +115,8 @@ def compare(level_name: str, episodes: np.ndarray) -> list[Comparison]:
             variance = binomial_variance(column)
         elif measure == "return":
             variance = max(variance, _GOAL_REWARD**2 * binomial_variance(MEASURES.index("goal")))
-        z = (ours - release) / math.sqrt(variance * share)
-        found.append(Comparison(measure, ours, release, z))
+        error = max(math.sqrt(variance * share), 1e-9)  # A few episodes may all be alike.
+        found.append(Comparison(measure, ours, release, (ours - release) / error))
     return found
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import pymunk
 
 from envs_host.create import handlers
-from envs_host.create.handlers import Contact
+from envs_host.create.handlers import Contact, Ledger
 from envs_host.create.things import Thing
 
 SUBSTEP_S = 1.0 / 30.0
@@ -45,10 +44,9 @@ class Stage:
     """Things in a space. A callback exists only once something that needs it has been added.
 
     Attributes:
-      laws: what the shape of a tool does to moving objects.
-      caught: shapes that a bucket has caught; the mark is never cleared (spec create 2.7).
-      met: pairs of shapes that have begun to touch: goal with moving, moving with moving.
-      inside: (moving, subgoal) shapes that touch now.
+      physics: gravity, variants.
+      space: the pymunk space.
+      ledger: what callbacks have noted.
     """
 
     def __init__(self, physics: PhysicsConfig) -> None:
@@ -56,17 +54,14 @@ class Stage:
         self.space = pymunk.Space()
         self.space.gravity = (0.0, -physics.gravity)
         self.space.sleep_time_threshold = SLEEP_TIME_S
-        self.laws: dict[pymunk.Shape, Any] = {}  # Any: a callback knows the law of its type.
-        self.caught: set[pymunk.Shape] = set()
-        self.met: set[frozenset[pymunk.Shape]] = set()
-        self.inside: set[tuple[pymunk.Shape, pymunk.Shape]] = set()
+        self.ledger = Ledger(physics.bucket_zeroes_velocity)
         self._handled: set[Contact] = set()
 
     def add(self, thing: Thing) -> None:
         """Puts a thing into the space, and its behaviour into force."""
         self.space.add(*thing.parts)
         if thing.law is not None:
-            self.laws[thing.shape] = thing.law
+            self.ledger.laws[thing.shape] = thing.law
         contact = Contact(thing.shape.collision_type)
         if contact not in self._handled:
             self._handled.add(contact)
@@ -75,7 +70,7 @@ class Stage:
     def remove(self, thing: Thing) -> None:
         """Takes a thing out of the space."""
         self.space.remove(*thing.parts)
-        self.laws.pop(thing.shape, None)
+        self.ledger.laws.pop(thing.shape, None)
 
     def is_free(self, thing: Thing) -> bool:
         """Whether the shape of a thing, not yet added, overlaps no shape of the space."""
@@ -89,11 +84,11 @@ class Stage:
 
     def have_met(self, first: Thing, second: Thing) -> bool:
         """Whether two things have begun to touch in any substep so far."""
-        return frozenset((first.shape, second.shape)) in self.met
+        return frozenset((first.shape, second.shape)) in self.ledger.met
 
     def is_inside(self, thing: Thing, subgoal: Thing) -> bool:
         """Whether a thing touches a subgoal disc as of the last substep."""
-        return (thing.shape, subgoal.shape) in self.inside
+        return (thing.shape, subgoal.shape) in self.ledger.inside
 
     def _handle(self, contact: Contact) -> None:
         """Registers the callbacks of one collision type."""
@@ -113,4 +108,4 @@ class Stage:
             },
         }
         if contact in callbacks:
-            self.space.on_collision(Contact.MOVING, contact, data=self, **callbacks[contact])
+            self.space.on_collision(Contact.MOVING, contact, data=self.ledger, **callbacks[contact])

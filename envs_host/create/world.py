@@ -23,7 +23,6 @@ from envs_host.create.stage import PhysicsConfig, Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import Tool, ToolClass, all_tools
 
-MIN_TOOL_DISTANCE = 0.3
 SUBGOAL_RADIUS = 3.0
 PROBE_RADIUS = 4.0
 PROBE_MASS = 10.0
@@ -69,7 +68,7 @@ class World:
         layout: Layout,
         physics: PhysicsConfig,
         frame_walls: bool,
-        min_tool_distance: float = MIN_TOOL_DISTANCE,
+        min_tool_distance: float,
     ) -> None:
         """Builds the world in the fixed order of spec create 5.0.
 

@@ -218,6 +218,10 @@ def test_a_folder_with_a_wrong_file_registers_nothing(tmp_path: Path) -> None:
     with pytest.raises(LevelError, match="another file has"):
         register_folder(tmp_path)
     assert "GoodOfTest" not in level_names()
+    (tmp_path / "b.json").write_text(json.dumps({**SMALL, "name": "Push"}))
+    with pytest.raises(LevelError, match="must not be one of those taken"):
+        register_folder(tmp_path)
+    assert "GoodOfTest" not in level_names()
 
 
 @pytest.mark.unit
@@ -227,10 +231,10 @@ def test_members_of_a_group_move_together_and_others_stay() -> None:
     assert layout.offsets["target"] == layout.offsets["medium_floor_0"]
     assert layout.offsets["goal"] == layout.offsets["medium_floor_1"]
     assert len(set(layout.offsets.values())) == 3
-    world = World(layout, PhysicsConfig(), frame_walls=False)
+    world = World(layout, PhysicsConfig(), frame_walls=False, min_tool_distance=0.3)
     dx, dy = layout.offsets["target"]
     assert world.positions.target == pytest.approx((46.2 + 42 * dx, 36.12 + 42 * dy))
-    still = World(Layout(level), PhysicsConfig(), frame_walls=False)
+    still = World(Layout(level), PhysicsConfig(), frame_walls=False, min_tool_distance=0.3)
     assert still.positions.target == pytest.approx((46.2, 36.12))
 
 

@@ -298,6 +298,10 @@ def test_mixes_hold_the_share_of_new_tools() -> None:
         assert len(ids) == int(ratio * len(new)) + int((1.0 - ratio) * 761)
         assert np.isin(ids, new).sum() == int(ratio * len(new))
         assert len(np.unique(ids)) == len(ids)
+        is_new = np.isin(ids, new)
+        # Neither part is the beginning of the ascending list.
+        assert ratio == 0.0 or ids[is_new].tolist() != new[: is_new.sum()].tolist()
+        assert ids[~is_new].tolist() != analysis_train_ids()[: (~is_new).sum()].tolist()
     assert mix_ids(table, 0.4, seed=3).tolist() == mix_ids(table, 0.4, seed=3).tolist()
     assert mix_ids(table, 0.4, seed=3).tolist() != mix_ids(table, 0.4, seed=4).tolist()
     with pytest.raises(ValueError, match="not in"):
