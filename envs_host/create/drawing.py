@@ -139,7 +139,7 @@ def _places(pixels: np.ndarray, size: int) -> np.ndarray:
 
 
 def _is_inside(pixels: np.ndarray, size: int) -> np.ndarray:
-    return np.logical_and(pixels >= 0, pixels < size).all(axis=1)
+    return np.all((pixels >= 0) & (pixels < size), axis=1)
 
 
 def _turning_print(sprite: Sprite, size: int) -> _Print:
