@@ -26,6 +26,8 @@ PEOPLE_SIZE = 1024
 # Boxes and basketballs are drawn in 72 positions, so that each is computed once.
 _TURNING = frozenset({Kind.BASKETBALL, Kind.BOX})
 _NUM_TURNS = 72
+# Pixels; so that corners that are whole numbers but for rounding are not one pixel too far.
+_NOISE = 1e-6
 _GRAYS = GRAY_OF_INK.tolist()
 _INKS = list(range(len(_GRAYS)))
 
@@ -207,4 +209,4 @@ def _pixel(sprite: Sprite, size: int, distance: float, angle: float) -> raster.P
     scale = size / WORLD_SIZE
     x = sprite.x + distance * math.cos(angle)
     y = sprite.y + distance * math.sin(angle)
-    return int(size - y * scale), int(x * scale)
+    return int(size - y * scale + _NOISE), int(x * scale + _NOISE)
