@@ -209,4 +209,4 @@ def _pixel(sprite: Sprite, size: int, distance: float, angle: float) -> raster.P
     scale = size / WORLD_SIZE
     x = sprite.x + distance * math.cos(angle)
     y = sprite.y + distance * math.sin(angle)
-    return int(size - y * scale + _NOISE), int(x * scale + _NOISE)
+    return math.floor(size - y * scale + _NOISE), math.floor(x * scale + _NOISE)
