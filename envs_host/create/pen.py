@@ -76,9 +76,8 @@ class Pen:
         broad = max(1, round(width * self._pixels_per_unit))
         self._draw.line(pixels, fill=color, width=broad)
         if broad > 2:
-            for x, y in pixels:
-                reach = (broad - 1) / 2.0
-                self._draw.ellipse((x - reach, y - reach, x + reach, y + reach), fill=color)
+            for pixel in pixels:
+                self._draw.ellipse(_box(pixel, broad / 2.0), fill=color)
 
     def disc(
         self,
@@ -89,10 +88,9 @@ class Pen:
         centre: Point = (0.0, 0.0),
     ) -> None:
         """A disc around a point of the frame, the outline inside it."""
-        x, y = self._pixel(centre)
         reach = radius * self._pixels_per_unit
         broad = 0 if outline is None else max(1, round(width * self._pixels_per_unit))
-        box = (x - reach, y - reach, x + reach, y + reach)
+        box = _box(self._pixel(centre), reach)
         self._draw.ellipse(box, fill=fill, outline=outline, width=broad)
 
     def ellipse(self, radii: Point, centre: Point = (0.0, 0.0), turn: float = 0.0) -> list[Point]:
@@ -120,4 +118,13 @@ class Pen:
         along, across = point[0], self._up * point[1]
         x = self._origin[0] + self._cos * along - self._sin * across
         y = self._origin[1] + self._sin * along + self._cos * across
-        return (WORLD_SIZE - x) * self._pixels_per_unit, (WORLD_SIZE - y) * self._pixels_per_unit
+        scale = self._pixels_per_unit
+        # Pillow counts from the middle of the first pixel.
+        return (WORLD_SIZE - x) * scale - 0.5, (WORLD_SIZE - y) * scale - 0.5
+
+
+def _box(centre: Point, reach: float) -> tuple[int, int, int, int]:
+    """First and last pixels of a disc, as Pillow wants them; it would cut fractions off."""
+    x, y = centre[0] + 0.5, centre[1] + 0.5
+    left, top = round(x - reach), round(y - reach)
+    return left, top, max(left, round(x + reach) - 1), max(top, round(y + reach) - 1)
