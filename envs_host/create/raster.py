@@ -6,7 +6,6 @@ int arrays [n, 2]; pixels may lie outside the picture.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -59,22 +58,25 @@ def line(start: Pixel, end: Pixel, width: int = 1) -> np.ndarray:
     return np.concatenate(pixels)
 
 
-def polygon(corners: Sequence[Pixel]) -> np.ndarray:
-    """Pixels of a filled polygon with corners on pixels; its outline belongs to it."""
-    rows = [row for row, _ in corners]
-    last = max(rows)
-    edges = list(zip(corners, [*corners[1:], corners[0]], strict=True))
-    pixels = [line(start, end) for start, end in edges]
-    for row in range(min(rows), last + 1):
-        crossings = sorted(
-            left[1] + (row - left[0]) * (right[1] - left[1]) / (right[0] - left[0])
-            for left, right in edges
-            if min(left[0], right[0]) <= row < max(left[0], right[0])
-        )
-        for left, right in zip(crossings[::2], crossings[1::2], strict=True):
-            columns = np.arange(math.ceil(left), math.floor(right) + 1)
-            pixels.append(np.stack([np.full(len(columns), row), columns], axis=1))
-    return np.unique(np.concatenate(pixels), axis=0)
+def convex_polygon(corners: Sequence[Pixel]) -> np.ndarray:
+    """Pixels of a filled convex polygon with corners on pixels, which belong to it.
+
+    Each row is filled from its leftmost to its rightmost crossing with the edges, both rounded.
+    """
+    start = np.array(corners)
+    rise, run = (np.roll(start, -1, axis=0) - start).T
+    rows = np.arange(start[:, 0].min(), start[:, 0].max() + 1)
+    columns = np.arange(start[:, 1].min(), start[:, 1].max() + 1)
+    # Rows of flat edges are crossed by their neighbours, in the same corners.
+    share = (rows[:, None] - start[:, 0]) / np.where(rise == 0, np.inf, rise)
+    is_crossed = (share >= 0.0) & (share <= 1.0) & (rise != 0)
+    crossing = np.floor(start[:, 1] + share * run + 0.5)
+    left = np.where(is_crossed, crossing, np.inf).min(axis=1)
+    right = np.where(is_crossed, crossing, -np.inf).max(axis=1)
+    if len(rows) == 1:
+        left, right = columns[:1], columns[-1:]
+    is_filled = (columns >= left[:, None]) & (columns <= right[:, None])
+    return np.argwhere(is_filled) + np.array([rows[0], columns[0]])
 
 
 def star(radius: float) -> np.ndarray:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from envs_host.create import CreateConfig, CreateEnv, colors, drawing, raster
+from envs_host.create import CreateConfig, CreateEnv, colors, forms, raster
 from envs_host.create.building import build_tool
 from envs_host.create.drawing import draw
 from envs_host.create.sprites import Kind, Sprite, Tone
@@ -399,9 +399,9 @@ def test_same_sprites_same_bits() -> None:
         env.step({"index": index, "position": env.np_random.uniform(-1, 1, 2)})
     sprites = tuple(env.world.sprites())
     first = draw(sprites)
-    drawing._print.cache_clear()
-    drawing._turned.cache_clear()
-    drawing._line_offsets.cache_clear()
+    for cached in (forms.fixed_print_of, forms._picture_form, forms._line_form):
+        assert cached.cache_info().currsize > 0
+        cached.cache_clear()
     assert np.array_equal(draw(sprites), first)
     first[:] = 0  # Belongs to the caller.
     assert draw(sprites).max() == 255
