@@ -47,15 +47,17 @@ def line(start: Pixel, end: Pixel, width: int = 1) -> np.ndarray:
     """
     rows, columns = end[0] - start[0], end[1] - start[1]
     num_steps = max(abs(rows), abs(columns), 1)
-    share = np.arange(num_steps + 1) / num_steps
-    row = start[0] + np.floor(share * rows + 0.5).astype(int)
-    column = start[1] + np.floor(share * columns + 0.5).astype(int)
+    # Halves are rounded up.
+    pixels = [
+        (start[0] + (2 * step * rows + num_steps) // (2 * num_steps),
+         start[1] + (2 * step * columns + num_steps) // (2 * num_steps))
+        for step in range(num_steps + 1)
+    ]  # fmt: skip
     is_flat = abs(columns) >= abs(rows)
-    pixels = []
-    for shift in range(-(width // 2), width - width // 2):
-        down, right = (shift, 0) if is_flat else (0, shift)
-        pixels.append(np.stack([row + down, column + right], axis=1))
-    return np.concatenate(pixels)
+    shifts = range(-(width // 2), width - width // 2)
+    if is_flat:
+        return np.array([(row + shift, column) for shift in shifts for row, column in pixels])
+    return np.array([(row, column + shift) for shift in shifts for row, column in pixels])
 
 
 def convex_polygon(corners: Sequence[Pixel]) -> np.ndarray:
@@ -63,20 +65,23 @@ def convex_polygon(corners: Sequence[Pixel]) -> np.ndarray:
 
     Each row is filled from its leftmost to its rightmost crossing with the edges, both rounded.
     """
-    start = np.array(corners)
-    rise, run = (np.roll(start, -1, axis=0) - start).T
-    rows = np.arange(start[:, 0].min(), start[:, 0].max() + 1)
-    columns = np.arange(start[:, 1].min(), start[:, 1].max() + 1)
-    # Rows of flat edges are crossed by their neighbours, in the same corners.
-    share = (rows[:, None] - start[:, 0]) / np.where(rise == 0, np.inf, rise)
-    is_crossed = (share >= 0.0) & (share <= 1.0) & (rise != 0)
-    crossing = np.floor(start[:, 1] + share * run + 0.5)
-    left = np.where(is_crossed, crossing, np.inf).min(axis=1)
-    right = np.where(is_crossed, crossing, -np.inf).max(axis=1)
-    if len(rows) == 1:
-        left, right = columns[:1], columns[-1:]
-    is_filled = (columns >= left[:, None]) & (columns <= right[:, None])
-    return np.argwhere(is_filled) + np.array([rows[0], columns[0]])
+    sides: dict[int, tuple[int, int]] = {}  # By row; plain Python is quicker for so few pixels.
+    for (row, column), (end_row, end_column) in zip(
+        corners, [*corners[1:], corners[0]], strict=True
+    ):
+        rise, run = end_row - row, end_column - column
+        step = 1 if rise >= 0 else -1
+        for down in range(0, rise + step, step):
+            crossing = column + ((2 * down * run + rise) // (2 * rise) if rise else 0)
+            left, right = sides.get(row + down, (crossing, crossing))
+            sides[row + down] = min(left, crossing), max(right, crossing)
+    return np.array(
+        [
+            (row, column)
+            for row, (left, right) in sorted(sides.items())
+            for column in range(left, right + 1)
+        ]
+    )
 
 
 def star(radius: float) -> np.ndarray:

@@ -20,6 +20,7 @@ SUBJECTS = (
     "evaluation",
     "representation",
     "sweep",
+    "create",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
