@@ -203,12 +203,12 @@ def _basket(pen: Pen, sprite: Sprite) -> None:
 def _basketball(pen: Pen, sprite: Sprite) -> None:
     radius, seam = sprite.size, darker(LEATHER, 0.65)
     pen.disc(radius, LEATHER, seam, 0.35)
-    pen.line([(-radius, 0.0), (radius, 0.0)], seam, 0.3)
-    pen.line([(0.0, -radius), (0.0, radius)], seam, 0.3)
+    pen.line([(-0.95 * radius, 0.0), (0.95 * radius, 0.0)], seam, 0.3)
+    pen.line([(0.0, -0.95 * radius), (0.0, 0.95 * radius)], seam, 0.3)
     for side in (-1.0, 1.0):
         centre = (side * 1.25 * radius, 0.0)
         middle = math.pi if side > 0.0 else 0.0
-        curve = pen.arc((0.78 * radius, 0.95 * radius), centre, middle - 0.93, middle + 0.93)
+        curve = pen.arc((0.78 * radius, 0.95 * radius), centre, middle - 0.72, middle + 0.72)
         pen.line(curve, seam, 0.3)
 
 

@@ -73,7 +73,7 @@ class Thing:
                 yield sprite
             else:
                 x, y = body.position
-                # Written out, because `dataclasses.replace` is slow.
+                # Written out, because `_replace` is slow.
                 kind, size, tone = sprite.kind, sprite.size, sprite.tone
                 angle = body.angle + sprite.angle
                 yield Sprite(kind, x, y, angle, size, tone, sprite.width, sprite.sides)
