@@ -34,7 +34,7 @@ class CreateEnv(gymnasium.Env):
     """Physics puzzles: place tools so that the target ball reaches the goal.
 
     Observation: the frame after the action, uint8: gray [84, 84], RGB [84, 84, 3], or [0] with
-    `observation="none"`. Grey scale and the stack of three frames belong to the training wrapper.
+    `observation="none"`. The stack of three frames belongs to the training wrapper.
 
     Action: {"index": int, "position": f32[2]}. The index is a place in the available set (or a
     tool's id, with `action_ids="universe"`); the position is the tool's centre, normalised, clipped

@@ -165,7 +165,10 @@ def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger
 
 
 def damp(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Plank: slows balls, and only balls, after the solver (2.8)."""
+    """Plank: slows balls, and only balls, after the solver (2.8).
+
+    A factor of 1 is applied, too: writing a velocity keeps the engine from putting a body to sleep.
+    """
     shape, plank = arbiter.shapes
     if isinstance(shape, pymunk.Circle):
         factor = ledger.laws[plank].damping

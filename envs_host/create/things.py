@@ -24,7 +24,6 @@ from envs_host.create.handlers import (
 )
 from envs_host.create.sprites import Kind, Sprite, Tone
 
-STAR_RADIUS = 4.0
 TRAMPOLINE_THICKNESS = 2.0
 _STAR_INNER_SHARE = 0.5
 _CANNON_SIZE = (7.3, 10.0)
@@ -106,7 +105,7 @@ def dynamic_box(
     return Thing(body, shape, ((body, Sprite(Kind.BOX, 0.0, 0.0, 0.0, side, Tone.PICTURE)),))
 
 
-def star(position: Point, radius: float = STAR_RADIUS) -> Thing:
+def star(position: Point, radius: float) -> Thing:
     """A fixed goal: a sensor with the hull of a five-pointed star (1.5)."""
     body = _static(position)
     corners = _corners(5, radius, math.pi / 2.0)

@@ -9,6 +9,9 @@ from envs_host.create.tools.catalogue import (
     no_op_id,
 )
 from envs_host.create.tools.splits import (
+    ANALYSIS_ANGLES_DEG,
+    ANALYSIS_DISTANCES,
+    ANALYSIS_UNSEEN_RATIOS,
     analysis_ids,
     analysis_split,
     analysis_train_ids,
@@ -23,6 +26,9 @@ from envs_host.create.tools.splits import (
 from envs_host.create.tools.universe import tool_universe
 
 __all__ = [
+    "ANALYSIS_ANGLES_DEG",
+    "ANALYSIS_DISTANCES",
+    "ANALYSIS_UNSEEN_RATIOS",
     "CLASS_ORDER",
     "POLYGON_SIDES",
     "Tool",

@@ -92,7 +92,7 @@ def test_every_object_type_can_be_placed_and_drawn(type_name: str) -> None:
         ("medium_floor", {"length": 16}),
         ("short_floor", {"length": 8}),
         ("very_short_floor", {"length": 4}),
-        ("floor", {"length": 16, "angle_deg": 0}),
+        ("floor", {"length": 16, "angle_deg": 0, "thickness": 2, "friction": 1}),
         ("wall", {"length": 16, "angle_deg": 90}),
         ("elastic_wall", {"length": 16, "angle_deg": 90, "elasticity": 0.8}),
         ("ramp_30", {"length": 16, "angle_deg": 30, "elasticity": 0.5}),

@@ -123,6 +123,8 @@ def test_throws_aim_at_the_tool_and_grow_faster() -> None:
         scale = 25.0 * (1.0 + 0.4 * trial)
         assert 0.6 * scale <= min(speeds) < 0.61 * scale
         assert 1.39 * scale < max(speeds) <= 1.4 * scale
+    near = [math.hypot(*play._velocity(rng, (0.0, 0.0), (0.3, 0.4), 0)) for _ in range(300)]
+    assert 1.39 * 12.5 * 1.5 < max(near) <= 1.4 * 12.5 * 1.5  # d = 0.5.
 
 
 @pytest.mark.unit
