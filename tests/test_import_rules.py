@@ -33,7 +33,7 @@ HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
     "mujoco": {"envs_mjx.shape_stacking"},
 }
-HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "jaxnew.actions"}
+HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "PIL", "jaxnew.actions"}
 
 
 def module_name(path: Path, root: Path = ROOT) -> str:

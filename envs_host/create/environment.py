@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 import numpy as np
@@ -21,7 +21,11 @@ from envs_host.create.levels import Level, load_level
 from envs_host.create.tools import Tool, all_tools
 from envs_host.create.world import Placement, World
 
+if TYPE_CHECKING:
+    from envs_host.create.illustration import RenderOptions
+
 _DRAWING = "envs_host.create.drawing"
+_FILMS = "envs_host.create.films"
 
 Action = Mapping[str, Any]
 
@@ -63,6 +67,7 @@ class CreateEnv(gymnasium.Env):
         candidates: Sequence[int] | np.ndarray | None = None,
         sampler: Sampler = uniform_ids,
         render_mode: str | None = None,
+        render_options: RenderOptions | None = None,
     ) -> None:
         """An environment of one level.
 
@@ -73,6 +78,7 @@ class CreateEnv(gymnasium.Env):
           candidates: ids that action sets are drawn from, instead of the config's part of a split.
           sampler: how a set is drawn from the candidates.
           render_mode: "rgb_array" for `render`, or None.
+          render_options: what `render` shows; default: 1024 pixels with everything.
 
         Raises:
           LevelError, ValueError: the level, the candidates or the render mode cannot be used.
@@ -86,7 +92,12 @@ class CreateEnv(gymnasium.Env):
         self._tools = all_tools(self.config.angle_spacing)
         self._candidates = self._checked_candidates(candidates)
         self._sampler = sampler
-        self._drawing = None if self.config.observation == "none" else _load_drawing()
+        self._drawing = None if self.config.observation == "none" else _load(_DRAWING)
+        # Called after every 4 substeps, for films.
+        self.watch: Callable[[World], None] | None = None
+        self._films = None if render_mode is None else _load(_FILMS)
+        self._trail = None if self._films is None else self._films.Trail()
+        self._render_options = render_options
         self._available = np.arange(len(self._tools), dtype=np.int32)
         self._episode: Episode | None = None
         self._is_over = True
@@ -134,6 +145,8 @@ class CreateEnv(gymnasium.Env):
         layout_rng, set_rng = self.np_random.spawn(2)
         self._episode = Episode(self._layout(layout_rng), self.config)
         self._is_over = False
+        if self._trail is not None:
+            self._trail.restart(self.world)
         if self.config.action_ids == "set":
             self._available = draw_action_set(
                 set_rng,
@@ -154,7 +167,8 @@ class CreateEnv(gymnasium.Env):
         episode = self.episode
         if self._is_over:
             raise RuntimeError("The episode is over; call reset() first.")
-        episode.simulate(*self._read(action))
+        watch = None if self.watch is None and self._trail is None else self._show
+        episode.simulate(*self._read(action), watch)
         observation = self._observe()
         outcome = episode.judge()
         self._is_over = bool(outcome.ends)
@@ -173,10 +187,17 @@ class CreateEnv(gymnasium.Env):
         return self.world.check_placement(tool, point) == Placement.PLACED
 
     def render(self) -> np.ndarray | None:
-        """uint8[H, W, 3] picture for people, if the render mode is "rgb_array"."""
-        if self.render_mode is None:
+        """uint8[size, size, 3] picture for people, if the render mode is "rgb_array"."""
+        if self._films is None:
             return None
-        return _load_drawing().draw(tuple(self.world.sprites()), mode="people")
+        options = self._render_options or self._films.DEFAULT_OPTIONS
+        return self._films.picture(self.world, self._trail, self.episode.summary, options)
+
+    def _show(self, world: World) -> None:
+        """Lets those who follow the world between decisions see it."""
+        for watch in (self._trail, self.watch):
+            if watch is not None:
+                watch(world)
 
     def _layout(self, rng: np.random.Generator) -> Layout:
         if self.deterministic:
@@ -188,9 +209,8 @@ class CreateEnv(gymnasium.Env):
     def _observe(self) -> np.ndarray:
         if self._drawing is None:
             return np.zeros(0, np.uint8)
-        sprites = tuple(self.world.sprites())
         return self._drawing.draw(
-            sprites, mode=self.config.observation, size=self.config.render_size
+            self.world.sprites(), mode=self.config.observation, size=self.config.render_size
         )
 
     def _info(self, placement: Placement) -> dict[str, Any]:
@@ -246,16 +266,16 @@ def _observation_shape(config: CreateConfig) -> tuple[int, ...]:
     return {"gray": (size, size), "rgb": (size, size, 3), "none": (0,)}[config.observation]
 
 
-def _load_drawing() -> ModuleType:
-    """The renderer, imported only by what draws.
+def _load(name: str) -> ModuleType:
+    """A module of pictures, imported only by what draws.
 
     Raises:
       ImportError: it, or what it needs, is not there.
     """
     try:
-        return importlib.import_module(_DRAWING)
+        return importlib.import_module(name)
     except ImportError as err:
         raise ImportError(
-            f"{_DRAWING} cannot be imported ({err}). For physics without pictures set "
-            "observation='none'."
+            f"{name} cannot be imported ({err}). For physics without pictures set "
+            "observation='none' and render_mode=None."
         ) from err

@@ -20,6 +20,7 @@ from envs_host.create.world import ContactWatch, probe_ball
 NUM_STATES = 7
 STATE_SIZE = 6
 POSITION_COLUMNS = (2, 3)
+IMAGE_SIZE = 48
 MAX_TRIALS = 8
 
 _NUM_RUNS = 3
@@ -105,6 +106,31 @@ def record_block(
     ]
     states = np.array(blocks, np.float32).reshape(len(ids), num_recordings, NUM_STATES, STATE_SIZE)
     return states[..., list(POSITION_COLUMNS)] if positions_only else states
+
+
+def record_images(
+    seed: int,
+    ids: Sequence[int] | np.ndarray,
+    num_recordings: int,
+    config: PlayConfig | None = None,
+) -> np.ndarray:
+    """Video recordings of tools: the trajectories of `record_block` with the same arguments, seen.
+
+    Returns:
+      u8[n, S, 7, 48, 48] gray frames: tool and ball on white, lines at least one pixel wide (A13).
+
+    Raises:
+      ValueError: an id does not exist, or there is nothing to record.
+    """
+    from envs_host.create.drawing import draw
+
+    of_tools = record_worlds(seed, ids, num_recordings, config)
+    frames = np.empty((len(ids), num_recordings, NUM_STATES, IMAGE_SIZE, IMAGE_SIZE), np.uint8)
+    for of_tool, recordings in zip(frames, of_tools, strict=True):
+        for of_recording, recording in zip(of_tool, recordings, strict=True):
+            for place, snapshot in enumerate(recording.snapshots):
+                of_recording[place] = draw(snapshot.sprites, "gray", IMAGE_SIZE)
+    return frames
 
 
 def record_worlds(

@@ -9,8 +9,8 @@ ground and sorts nothing. Reached subgoals are no longer yielded.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import StrEnum
+from typing import NamedTuple
 
 
 class Kind(StrEnum):
@@ -51,8 +51,7 @@ class Tone(StrEnum):
     PICTURE = "picture"
 
 
-@dataclass(frozen=True, slots=True)
-class Sprite:
+class Sprite(NamedTuple):
     """One thing to draw, in world units (the world is an 84 x 84 square, y up, x right).
 
     The picture mirrors x; that is the renderer's business, here nothing is mirrored.

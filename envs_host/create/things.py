@@ -72,7 +72,10 @@ class Thing:
                 yield sprite
             else:
                 x, y = body.position
-                yield replace(sprite, x=x, y=y, angle=body.angle + sprite.angle)
+                # Written out, because `_replace` is slow.
+                kind, size, tone = sprite.kind, sprite.size, sprite.tone
+                angle = body.angle + sprite.angle
+                yield Sprite(kind, x, y, angle, size, tone, sprite.width, sprite.sides)
 
 
 def ball(

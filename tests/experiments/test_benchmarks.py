@@ -15,7 +15,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments.benchmarks import _floor, environment, pool, run, sweep, training
+from experiments.benchmarks import _floor, create, environment, pool, run, sweep, training
 from experiments.benchmarks import _measure as m
 from jaxnew.ppo import Learner
 from jaxnew.rollout.device import DeviceRollout
@@ -229,6 +229,29 @@ def test_environment_runs_without_peers(tmp_path: Path) -> None:
             decisions, moves = (line["rates"][unit]["median"] for unit in ("decisions", "moves"))
             assert line["num_envs"] == 4
             assert moves == pytest.approx(5 * decisions)
+
+
+@pytest.mark.integration
+def test_create_tells_what_drawing_and_physics_take(tmp_path: Path) -> None:
+    lines = {line["case"]: line for line in run_quick("create", tmp_path)}
+    for name in ("gray", "rgb", "none"):
+        rates = lines[f"Push, observation {name}"]["rates"]
+        assert rates["substeps"]["median"] == pytest.approx(40 * rates["decisions"]["median"])
+        assert ("rendering" in lines[f"Push, observation {name}"]["includes"]) == (name != "none")
+    assert 0.0 < lines["Push, share of the physics"]["values"]["cpu"] < 1.0
+    for tools in (0, 10):
+        assert lines[f"one gray frame, Push with {tools} tools"]["rates"]["frames"]["median"] > 0
+
+
+@pytest.mark.unit
+def test_the_clock_of_the_physics_is_taken_off_again() -> None:
+    run_before, clock = create.Stage.run, create.Clock()
+    env = create.crowded_env("Push", 3)
+    assert len(env.world.tools) == 3
+    with create.timed_physics(clock):
+        env.world.run(2000)
+    assert 0.0 < clock.physics <= clock.whole
+    assert create.Stage.run is run_before
 
 
 @pytest.mark.slow

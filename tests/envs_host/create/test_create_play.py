@@ -8,10 +8,17 @@ import numpy as np
 import pytest
 
 from envs_host.create import play
-from envs_host.create.play import PlayConfig, mean_trials, record_block, record_worlds
+from envs_host.create.play import (
+    PlayConfig,
+    mean_trials,
+    record_block,
+    record_images,
+    record_worlds,
+)
 from envs_host.create.sprites import Kind
-from envs_host.create.tools import ToolClass, all_tools
+from envs_host.create.tools import ToolClass, all_tools, no_op_id
 
+NO_OP_ID = no_op_id()
 ONE_OF_EACH = [next(t.id for t in all_tools() if t.tool_class == c) for c in ToolClass]
 
 
@@ -209,3 +216,41 @@ def test_the_3_degree_list_can_be_recorded() -> None:
 def test_wrong_requests_are_refused(seed: int, ids: list[int], number: int, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         record_block(seed, ids, number)
+
+
+@pytest.mark.contract
+def test_images_show_the_trajectories_of_the_states() -> None:
+    ids = [0, 359, 1400, 1700, 1900, 2040, 2200, 2300, NO_OP_ID]
+    states, images = record_block(4, ids, 3), record_images(4, ids, 3)
+    assert images.shape == (9, 3, 7, 48, 48)
+    assert images.dtype == np.uint8
+    assert np.array_equal(images[2:4, :2], record_images(4, ids[2:4], 2))
+    seen = 0
+    for state, image in zip(states.reshape(-1, 6), images.reshape(-1, 48, 48), strict=True):
+        # The probe ball of radius int(4 * 48 / 84) = 2 is drawn last: 12 pixels of gray 168, around
+        # the corner (int(x), int(48 - y)) of pixels, mirrored.
+        x, y = (state[2:4].astype(float) + 1.0) * 24.0
+        row, column = int(48 - y), int(x)
+        if 2 <= row <= 45 and 2 <= column <= 45:
+            seen += 1
+            ball = image[row - 2 : row + 2, 46 - column : 50 - column] == 168
+            assert ball.sum() >= 12
+            assert ball[1:3].all()
+    assert seen > 100
+    no_op = images[-1].reshape(-1, 48 * 48)
+    assert set(np.unique(no_op)) == {168, 255}
+
+
+@pytest.mark.contract
+def test_tools_are_seen_beside_the_ball() -> None:
+    ids = np.random.default_rng(0).choice(NO_OP_ID, 60, replace=False)
+    for image in record_images(1, ids, 1)[:, 0, 0]:
+        assert (image != 255).sum() >= 12
+
+
+@pytest.mark.unit
+def test_images_of_what_is_not_there() -> None:
+    with pytest.raises(ValueError, match="2366"):
+        record_images(0, [2366], 1)
+    with pytest.raises(ValueError, match="at least 1"):
+        record_images(0, [0], 0)
