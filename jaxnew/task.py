@@ -104,12 +104,15 @@ class Baselines:
       sums_gaussian_entropy: its entropy is summed over dimensions instead of averaged.
       fixed_set: `ids -> ids` of the one set that the utility policy scores where it is trained
         without subsampling.
+      fixed_set_minibatches: minibatches per pass of the utility policy without subsampling; 0 for
+        as many as with it.
       finetune_share: updates of fine-tuning on new actions over those of training (spec method 9).
     """
 
     continuous_rollout_share: float = 1.0
     sums_gaussian_entropy: bool = False
     fixed_set: Callable[[np.ndarray], np.ndarray] = lambda ids: ids
+    fixed_set_minibatches: int = 0
     finetune_share: float = 1.0
 
 

@@ -20,11 +20,8 @@ SUBJECTS = (
     "evaluation",
     "representation",
     "sweep",
-<<<<<<< HEAD
     "pool",
-=======
     "create",
->>>>>>> create-draw
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
