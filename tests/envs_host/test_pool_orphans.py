@@ -80,6 +80,9 @@ def test_ctrl_c(kind: str) -> None:
 def test_parent_is_killed(kind: str, number: signal.Signals) -> None:
     """Also while workers are in a step that never ends."""
     with parent(kind) as (process, pids):
+        if kind == "hang":
+            assert process.stderr is not None
+            assert [process.stderr.readline() for _ in pids] == ["about to hang\n"] * 2
         os.kill(process.pid, number)
         assert assert_nothing_left(process, pids) == ""
     assert process.returncode == -number
