@@ -60,7 +60,8 @@ def draw(
 
 def _draw_grays(sprites: Iterable[Sprite], size: int) -> np.ndarray:
     """u8[size, size] of grays."""
-    frame = np.full(size * size, WHITE_GRAY, np.uint8)
+    frame = np.empty(size * size, np.uint8)
+    frame.fill(WHITE_GRAY)
     for sprite in sprites:
         make = print_of if sprite.kind in _MOVING else fixed_print_of
         places, grays, _ = make(sprite, size)
