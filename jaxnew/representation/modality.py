@@ -25,8 +25,8 @@ class Modality:
       likelihood: "gaussian" or "categorical".
       num_categories: categories per coordinate for a categorical likelihood, whose D numbers are
         one-hot blocks of that size, one after the other; 0 for a Gaussian one.
-      featurize: stored recordings [..., T, D0], uint8 or float -> f32[..., T, D]; pure JAX. Images are
-        stored [..., T, height, width, channels], stills without T, which is 1.
+      featurize: stored recordings [..., T, D0], uint8 or float -> f32[..., T, D]; pure JAX. Images
+        are stored [..., T, height, width, channels], stills without T, which is 1.
       image_shape: (side, side, channels) where a step is an image, whose D numbers are then in that
         order; else None.
       is_still: whether a recording is one image.

@@ -42,7 +42,8 @@ class FlatInference(nn.Module):
 class FlatVAE(nn.Module):
     """The flat VAE: encoder, `q(z | o)`, decoder, prior N(0, I).
 
-    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation (spec method 4).
+    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation
+    (spec method 4).
 
     Attributes:
       encoder_width: E.
