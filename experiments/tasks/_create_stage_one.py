@@ -1,8 +1,8 @@
 """CREATE's recordings as network inputs, and the HVAEs for them (spec method 3, columns CREATE).
 
-A recording is stored as f32[7, 6] states (tool x, y; ball x, y; ball velocity, all in the affine map
-of positions) or as uint8[7, 48, 48, 1] frames. N_train // B gradient steps are an epoch: with 1,098
-train tools 8 of states, 34 of videos.
+A recording is stored as f32[7, 6] states (tool x, y; ball x, y; ball velocity, all in the affine
+map of positions) or as uint8[7, 48, 48, 1] frames. N_train // B gradient steps are an epoch: with
+1,098 train tools 8 of states, 34 of videos.
 """
 
 from __future__ import annotations
