@@ -84,6 +84,21 @@ def test_frames_become_codes_and_codes_become_frames(side):
     np.testing.assert_allclose(mask, expected_mask, **TOLERANCE)
 
 
+@pytest.mark.unit
+def test_convolutions_start_as_pytorchs():
+    """Uniform in +-1/sqrt(fan_in); a transposed one counts its outputs (spec method 3.1)."""
+    x = np.zeros((1, 4, 4, 16), np.float32)
+    plain = images.Convolution(32)
+    up = images.TransposedConvolution(images._Upsampling(8, 3, 1))
+    for module, fan_in in ((plain, 9 * 16), (up, 9 * 8)):
+        params = jax.jit(module.init)(jax.random.key(0), x)["params"]
+        bound = 1 / np.sqrt(fan_in)
+        kernel = np.asarray(params["kernel"]).ravel()
+        assert 0.97 * bound < np.abs(kernel).max() <= bound
+        np.testing.assert_allclose(kernel.std(), bound / np.sqrt(3), rtol=0.1)
+        assert 0.4 * bound < np.abs(params["bias"]).max() <= bound
+
+
 @pytest.mark.oracle
 def test_a_video_is_drawn_over_its_first_frame():
     """Codes of the first frame start the LSTM; each prediction is mixed with the frame itself."""
