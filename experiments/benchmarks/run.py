@@ -15,6 +15,7 @@ from experiments.benchmarks import _measure as m
 SUBJECTS = (
     "environment",
     "utility",
+    "images",
     "training",
     "methods",
     "evaluation",

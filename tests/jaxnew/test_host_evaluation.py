@@ -57,7 +57,9 @@ def test_numbers_depend_on_no_size() -> None:
     fewer = run(episodes=5)
     for name, values in whole.items():
         np.testing.assert_array_equal(values[:5], fewer[name])
-    assert len(np.unique(whole["episode_return"])) == EPISODES
+    # Bad actions are worth 0; other returns are equal only if episodes are.
+    returns = whole["episode_return"]
+    assert len(np.unique(returns[returns > 0])) == (returns > 0).sum() > 5
 
 
 @pytest.mark.oracle

@@ -10,14 +10,11 @@ import numpy as np
 import pytest
 from scipy import signal
 
+from jaxnew._convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.environment import ActionSpec
 from jaxnew.policy import distribution_and_value, make_method
 from jaxnew.policy.method import MethodContext
-from jaxnew.policy.state_encoder import (
-    ImageEncoder,
-    convolution_by_columns,
-    convolution_by_xla,
-)
+from jaxnew.policy.state_encoder import ImageEncoder
 from tests.jaxnew.policy import numpy_policy
 
 D, A, M = 128, 12, 5
@@ -116,14 +113,16 @@ def test_features_equal_scipy(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.oracle
-@pytest.mark.parametrize("size", [(84, 84), (21, 11), (6, 1)])
-def test_both_forms_of_the_convolution_are_one_function(size: tuple[int, int]) -> None:
+@pytest.mark.parametrize(
+    ("size", "stride"), [((42, 42), 2), ((21, 11), 2), ((6, 1), 2), ((5, 4), 1)]
+)
+def test_both_forms_of_the_convolution_are_one_function(size: tuple[int, int], stride: int) -> None:
     """With their gradients, with respect to images and kernel."""
     x = jnp.asarray(RNG.normal(size=(2, *size, 5)), jnp.float32)
     kernel = jnp.asarray(RNG.normal(size=(3, 3, 5, 7)), jnp.float32)
 
     def result(form: Any) -> Any:
-        value, pull_back = jax.vjp(form, x, kernel)
+        value, pull_back = jax.vjp(lambda x, kernel: form(x, kernel, stride), x, kernel)
         up = jnp.cos(jnp.arange(value.size, dtype=jnp.float32)).reshape(value.shape)
         return value, *pull_back(up)
 

@@ -167,6 +167,16 @@ def test_going_on_costs_nothing_and_a_checkpoint_is_brought_back() -> None:
 
 
 @pytest.mark.unit
+def test_a_run_begins_at_the_beginning_every_time() -> None:
+    """With a new pool, as one that was used goes on with its next episodes."""
+    rollout = rollout_of()
+    states, _, _ = play(rollout, 1)
+    used = rollout.environments.pool
+    assert_equal(rollout.init(jax.random.key(1), POOL), states[0])
+    assert used.is_closed
+
+
+@pytest.mark.unit
 def test_stacks_are_those_of_the_frames() -> None:
     frames = np.random.default_rng(0).integers(1, 255, (7, 2, 4, 5)).astype(np.uint8)
     age = np.array([[0, 2], [1, 0], [2, 1], [2, 2], [0, 2]], np.int32)
