@@ -304,6 +304,14 @@ def test_boxes_turn_with_their_body() -> None:
     assert rows(after) != rows(before)
 
 
+@pytest.mark.unit
+def test_what_rolls_has_few_forms() -> None:
+    """Each is computed once, though no two frames have the same angle."""
+    forms._picture_form.cache_clear()
+    frames = {draw([picture(Kind.BASKETBALL, 3.5, 0.01 * k)]).tobytes() for k in range(1000)}
+    assert 8 < len(frames) <= forms._picture_form.cache_info().currsize <= 72
+
+
 def every_kind() -> Iterator[Sprite]:
     yield from (disc(Tone.TARGET, *CENTRE), disc(Tone.TOOL, *CENTRE, 9.0))
     yield bar(*CENTRE, 0.4, 17.0, 2.0)

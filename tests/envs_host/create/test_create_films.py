@@ -156,13 +156,16 @@ def test_text_in_the_top_corners() -> None:
     assert inked[:, 0].max() < 40
     assert {bool(column < 200) for column in inked[:, 1]} == {True, False}
     assert not ((inked[:, 1] > 160) & (inked[:, 1] < 240)).any()
-    shown = env()
+    shown = CreateEnv(
+        "Push", True, BLIND, render_mode="rgb_array", render_options=RenderOptions(256)
+    )
     shown.reset(seed=0)
     before = shown.render()
     shown.step(NO_OP)
     after = shown.render()
-    # "action 0" becomes "action 1".
-    assert (before[:8, :32] != after[:8, :32]).any()
+    # "action 0" becomes "action 1", "return 0.00" becomes "return 0.01"; the marker is below.
+    for columns in (slice(0, 128), slice(128, 256)):
+        assert (before[:18, columns] != after[:18, columns]).any()
 
 
 @pytest.mark.contract
@@ -197,6 +200,14 @@ def test_film_of_an_episode() -> None:
     with pytest.raises(RuntimeError, match="over"):
         list(episode_frames(played, 0, [*SCRIPT, NO_OP], SMALL))
     assert played.watch is None
+
+
+@pytest.mark.unit
+def test_a_film_begins_where_its_seed_says() -> None:
+    noisy = CreateEnv("Push", False, BLIND)
+    first, again, other = (next(iter(episode_frames(noisy, seed, [], SMALL))) for seed in (3, 3, 4))
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first, other)
 
 
 @pytest.mark.unit
