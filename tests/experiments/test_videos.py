@@ -102,5 +102,7 @@ def test_sheet_of_the_tools() -> None:
         cell = sheet[top : top + 280, left : left + 420]
         thirds = (cell != 255).any(axis=-1).reshape(2, 140, 3, 140)
         inked.append(thirds.any(axis=(1, 3)).sum())
+        assert np.ptp(cell[140:], axis=-1).max() == 0  # Gray.
+        assert (np.ptp(cell[:140], axis=-1).max() > 0) == (place < 22)
     # Three tools in each, above for people and below for the agent.
     assert inked == [6] * 22 + [0, 0]
