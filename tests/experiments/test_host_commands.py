@@ -66,10 +66,9 @@ def test_finetune_with_the_test_actions(trained: Path, tmp_path: Path) -> None:
     assert 0 < distance(start) < 0.1 * distance(fresh)
 
 
-@pytest.mark.parametrize("method", ["nearest-neighbour", "continuous"])
-def test_other_methods_train_and_are_evaluated(method: str, tmp_path: Path) -> None:
-    flags = (*COMMON, f"--method={method}", "--set=num_updates=1", f"--workdir={tmp_path / 'run'}")
-    run("train", *flags)
+def test_a_method_with_a_fixed_set_trains_and_is_evaluated(tmp_path: Path) -> None:
+    method = "--method=nearest-neighbour"
+    run("train", *COMMON, method, "--set=num_updates=1", f"--workdir={tmp_path / 'run'}")
     run("evaluate", f"--run={tmp_path / 'run'}", "--episodes=3")
     assert read_json(tmp_path / "run" / "evaluation" / "test-best-sampled-m4.json")["metrics"]
 

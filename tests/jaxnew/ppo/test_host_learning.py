@@ -61,12 +61,13 @@ def test_ours_learns_where_to_put_which_action() -> None:
     )
     state = learner.init(jax.random.key(0), table, pool)
     before = return_of(learner, state.params, table, split.test)
-    state, metrics = learner.updates(state, NUMBERS, table, pool, 30)
+    state, _ = learner.updates(state, NUMBERS, table, pool, 30)
     train, test = (
         return_of(learner, state.params, table, ids) for ids in (split.train, split.test)
     )
-    # An episode of five actions at the right places is worth up to 4.25; half of them are bad.
-    print(before, train, test, metrics["episode/episode_return"])
-    assert before < 2.0
+    # Five good actions at the right places are worth up to 4.25. Half of the test sets hold the one
+    # good action of the test part, and the others none: up to 2.1, or 0.5 for a choice at random.
+    # Found: 0.25 before, then 3.3 and 1.9.
+    assert before < 0.6
     assert train > 2.6
-    assert test > 2.6
+    assert test > 1.5
