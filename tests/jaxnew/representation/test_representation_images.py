@@ -227,9 +227,9 @@ def test_both_vaes_take_both_kinds_of_images(is_flat):
         assert mean.shape == (2, 3 if is_flat else 2)
 
 
-@pytest.mark.unit
+@pytest.mark.slow
 def test_a_learner_trains_on_stored_videos():
-    """Two steps from uint8 recordings, and the encoding of new ones."""
+    """Two steps from uint8 recordings, and the encoding of new ones. Half a minute of compiling."""
     config = RepresentationConfig(
         encoder_width=4,
         inference_width=4,
