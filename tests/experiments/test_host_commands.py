@@ -48,7 +48,9 @@ def test_train_save_and_evaluate_in_a_new_process(trained: Path) -> None:
 
 
 def test_finetune_with_the_test_actions(trained: Path, tmp_path: Path) -> None:
-    run("finetune", f"--run={trained}", "--budget=smoke", f"--workdir={tmp_path / 'warm'}")
+    # Of another seed, whose fresh parameters are others.
+    flags = ("--budget=smoke", "--seed=7", f"--workdir={tmp_path / 'warm'}")
+    run("finetune", f"--run={trained}", *flags)
     config = read_json(tmp_path / "warm" / "config.json")
     assert (config["trained_on"], config["method"]) == ("test", "no-subsampling")
     _, source, _ = load_trainer(trained)
