@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxnew.environment import Action
 from jaxnew.policy.distributions import Categorical
 from jaxnew.policy.method import MethodContext
-from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorCritic, VectorEncoder, apply
+from jaxnew.policy.state_encoder import FEATURE_SIZE, StateCritic, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 WIDTH = 32
@@ -64,17 +64,17 @@ class AttentionMethod:
 
     def __init__(self, context: MethodContext) -> None:
         del context  # It needs to know nothing of the run.
-        self._encoder = VectorEncoder()
-        self._critic = VectorCritic()
+        self._encoder = StateEncoder()
+        self._critic = StateCritic()
         self._utility = SetUtility()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
-        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_encoder, key_critic, key_utility = jax.random.split(key, 3)
         some_set = jnp.zeros((2, representation_size)), jnp.ones(2, bool)
         return {
             "encoder": self._encoder.init(key_encoder, obs)["params"],
-            "critic": self._critic.init(key_critic, obs)["params"],
+            "critic": self._critic.init(key_critic, obs, jnp.zeros(FEATURE_SIZE))["params"],
             "utility": self._utility.init(
                 key_utility, jnp.zeros(FEATURE_SIZE), *some_set, method="whole"
             )["params"],
@@ -91,7 +91,7 @@ class AttentionMethod:
 
         Args:
           params: as `init` makes them.
-          obs: f32[..., n] normalised observations.
+          obs: f32[..., n] normalised observations, or uint8[..., H, W, C] images.
           projected: f32[..., m, 32] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
@@ -100,8 +100,9 @@ class AttentionMethod:
         return Categorical.masked(utilities, mask)
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[...] value of f32[..., n] normalised observations."""
-        return apply(self._critic, params["critic"], obs)
+        """f32[...] value of observations, as in `distribution`."""
+        features = apply(self._encoder, params["encoder"], obs)
+        return apply(self._critic, params["critic"], obs, features)
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The action behind a choice int32[...] from sets [..., m]."""

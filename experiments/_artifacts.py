@@ -54,6 +54,10 @@ class Domain:
         """Where this task's runs are kept."""
         return runs / self.task.name
 
+    def actions_folder(self, runs: Path) -> Path:
+        """Where recordings and encoders are kept, which tasks with the same actions share."""
+        return runs / (self.task.actions_name or self.task.name)
+
     @property
     def play(self) -> Play:
         """The play environment.
@@ -104,7 +108,7 @@ def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
 def collect_observations(domain: Domain, runs: Path, num_recordings: int) -> ActionObservations:
     """The recordings of every action of the domain, made now if they are not there."""
     return observations.collect(
-        domain.folder(runs) / f"recordings-{num_recordings}",
+        domain.actions_folder(runs) / f"recordings-{num_recordings}",
         domain.play.record_block,
         format=domain.play.format,
         universe=domain.universe,
@@ -138,7 +142,7 @@ def train_representation(
     recordings = collect_observations(domain, runs, budget.num_recordings)
     config = config_lib.set_paths(
         EmbedConfig(
-            task=domain.task.reference,
+            task=domain.task.actions_name or domain.task.reference,
             representation=name,
             split=domain.split_name,
             split_hash=domain.split.hash,
@@ -149,12 +153,14 @@ def train_representation(
         ),
         assignments or [],
     )
-    path = workdir or domain.folder(runs) / f"embed-{name}-{domain.split_name}-{budget_name}-{seed}"
+    run_name = f"embed-{name}-{domain.split_name}-{budget_name}-{seed}"
+    path = workdir or domain.actions_folder(runs) / run_name
     with RunDirectory.open_or_create(
         path, config_lib.to_dict(config), overwrite, {"split_hash": domain.split.hash}
     ) as run:
         learner = RepresentationLearner(config.model, modality)
-        rows = recordings.rows(domain.split.ids(config.train_on))
+        trained = np.union1d(domain.split.ids(config.train_on), domain.split.always_available)
+        rows = recordings.rows(trained)
         data = jnp.asarray(recordings.data[rows])
         if not (path / TABLE_FILE).exists():
             print(f"Training {name} ({config.model.num_steps} steps; {budget.cost}) in {path}.")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -92,14 +93,15 @@ def evaluate_run(path: Path, set_sizes: Mapping[str, int | None], num_episodes: 
     """
     run, trainer, split = load_trainer(path)
     state, step = load_state(run, trainer, "best")
-    for name, set_size in set_sizes.items():
-        row = evaluate_on(
-            trainer,
-            state,
-            name,
-            split.ids(name),
-            split,
-            num_episodes=num_episodes,
-            set_size=set_size,
-        )
-        record(run, name, "best", step, row)
+    with closing(trainer):
+        for name, set_size in set_sizes.items():
+            row = evaluate_on(
+                trainer,
+                state,
+                name,
+                split.ids(name),
+                split,
+                num_episodes=num_episodes,
+                set_size=set_size,
+            )
+            record(run, name, "best", step, row)

@@ -34,6 +34,9 @@ SEED = flags.DEFINE_integer("seed", 31, "Seed of the run.")
 WORKDIR = flags.DEFINE_string("workdir", None, "Directory of the run; default: below --runs.")
 RUNS = flags.DEFINE_string("runs", "runs", "Where runs and what they share are kept.")
 OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an existing run instead of resuming.")
+WORKERS = flags.DEFINE_integer(
+    "workers", 0, "Processes for environments on the host; 0: one per core.", lower_bound=0
+)
 SET = flags.DEFINE_multi_string("set", [], "path.to.field=value, for any field of the config.")
 DEBUG_NANS = flags.DEFINE_bool("debug_nans", False, "Stop at the operation that makes a NaN.")
 
@@ -72,7 +75,10 @@ def load_place(place: str, what: str, allowed: str) -> Any:
 
 
 def load_task(name: str) -> Task:
-    """A task by name (`grid_world`) or by place (`package.module:TASK`).
+    """A task by name (`grid_world`, `create-push`) or by place (`package.module:TASK`).
+
+    A module of `experiments/tasks` defines `TASK` or, for several tasks in one domain, `TASKS`, a
+    mapping from the part of the name after the dash; `TASK` is then the one without a dash.
 
     Raises:
       UsageError: there is no such module or object, or it is not a `Task`.
@@ -80,8 +86,14 @@ def load_task(name: str) -> Task:
     known = sorted(path.stem for path in (Path(__file__).parent / "tasks").glob("[a-z]*.py"))
     allowed = f"Tasks: {', '.join(known)}; or give package.module:TASK for one of your own."
     is_place = ":" in name
-    place = name if is_place else f"experiments.tasks.{name}:TASK"
+    module, _, variant = ("", "", "") if is_place else name.partition("-")
+    place = name if is_place else f"experiments.tasks.{module}:TASK{'S' if variant else ''}"
     task = load_place(place, f"task {name!r}", allowed)
+    if variant:
+        if variant not in task:
+            listed = ", ".join(f"{module}-{key}" for key in task)
+            raise UsageError(f"Unknown task {name!r}: there are {listed}.")
+        task = task[variant]
     if not isinstance(task, Task):
         raise UsageError(f"{place} is {task!r}, not a jaxnew.task.Task. {allowed}")
     return replace(task, place=name) if is_place else task

@@ -113,6 +113,8 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
         wanted = _FIXED_SET_NUMBERS // len(trained_ids(name, task, split))
         size = 2 ** max(2, int(np.log2(max(1, wanted))))
         ppo = replace(ppo, microbatch_size=min(size, ppo.microbatch_size))
+    if variant.scores_fixed_set and task.baselines.fixed_set_minibatches:
+        ppo = replace(ppo, num_minibatches=task.baselines.fixed_set_minibatches)
     if variant.is_without_entropy:
         hyperparameters = replace(hyperparameters, entropy_coefficient=0.0)
     return replace(budget, ppo=replace(ppo, rollout=rollout), hyperparameters=hyperparameters)
@@ -134,7 +136,7 @@ def method_of(
       conditions_position: see `MethodContext`.
     """
     context = MethodContext(
-        train_ids=trained_ids(name, task, split, part),
+        train_ids=np.concatenate([split.always_available, trained_ids(name, task, split, part)]),
         sums_gaussian_entropy=task.baselines.sums_gaussian_entropy,
         action_spec=action_spec,
         conditions_position=conditions_position,

@@ -83,7 +83,7 @@ class Source:
     def embed_folder(self, representation: str) -> Path:
         """Where `embed` keeps a representation."""
         name = f"embed-{representation}-{self.domain.split_name}-{self.stage_one}"
-        return self.domain.folder(self.folder) / f"{name}-{REPRESENTATION_SEED}"
+        return self.domain.actions_folder(self.folder) / f"{name}-{REPRESENTATION_SEED}"
 
 
 def find(source: Source, cell: Cell) -> dict[int, Run]:

@@ -18,6 +18,7 @@ from experiments import _plots as plots
 from experiments._artifacts import Domain, collect_observations, load_encoder
 from experiments._evaluation import evaluate_on, record
 from experiments._methods import file_name
+from experiments._paper import paper_value
 from experiments._plots import Metric
 from experiments._production import Job, Source, duration, training_seconds
 from experiments._runs import Group, group_runs, read_runs
@@ -35,12 +36,14 @@ class StudyPoint:
       x: place on the horizontal axis.
       means: f64[n] of each seed.
       num_episodes: per seed; 0 for the best evaluation during training.
+      paper: the paper's mean, or None.
     """
 
     setting: str
     x: float
     means: np.ndarray
     num_episodes: int
+    paper: float | None = None
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,7 @@ def _unseen_ratio(context: Context, value: float) -> Condition:
 def _growing_set(context: Context, value: float) -> Condition:
     trainer, split, _ = context
     size = trainer.config.ppo.rollout.set_size
-    steps = trainer.evaluator.env.max_episode_steps(trainer.evaluator.env_params)
+    steps = trainer.evaluator.max_episode_steps
     growth = -(-(size - int(value)) // max(1, steps - 1))  # Complete at the last step.
     options = {"set_size": size, "first_size": int(value), "growth": growth}
     return Condition("test", split.test, options if value < size else {"set_size": size})
@@ -117,6 +120,7 @@ class _Kind:
       values: of the axis.
       condition: what a value means.
       note: below the table.
+      paper_method: see `ActionStudy`.
     """
 
     axis: str
@@ -124,6 +128,7 @@ class _Kind:
     condition: Callable[[Context, float], Condition]
     note: str
     has_log_axis: bool = False
+    paper_method: Callable[[float], str] | None = None
 
 
 def _sizes(task: Task) -> list[float]:
@@ -164,6 +169,37 @@ STUDIES = {
 }
 
 
+def _kind_of(name: str, task: Task) -> _Kind:
+    """A study of every task, or one of this task's own.
+
+    Raises:
+      UsageError: there is none of that name.
+    """
+    if name in STUDIES:
+        return STUDIES[name]
+    if name not in task.studies:
+        listed = ", ".join([*STUDIES, *task.studies])
+        raise flag.UsageError(f"Task {task.name} has no study {name!r}; choose one of {listed}.")
+    study = task.studies[name]
+
+    def condition(context: Context, value: float) -> Condition:
+        trainer, _, _ = context
+        size = trainer.config.ppo.rollout.set_size
+        ids = study.ids(np.asarray(trainer.table), value)
+        return Condition(f"{name}-{value:g}", ids, {"set_size": size})
+
+    return _Kind(
+        study.axis, lambda task: study.values, condition, study.note, False, study.paper_method
+    )
+
+
+def _paper_mean(kind: _Kind, group: Group, value: float) -> float | None:
+    if kind.paper_method is None or group.paper_environment is None:
+        return None
+    found = paper_value(group.paper_environment, kind.paper_method(value), "test")
+    return None if found is None else found.mean
+
+
 def study_runs(
     name: str,
     paths: Sequence[Path],
@@ -180,7 +216,7 @@ def study_runs(
     if not runs:
         raise flag.UsageError("Say which runs to study: --run=DIRECTORY[,DIRECTORY...].")
     groups = group_runs(runs)
-    kind = STUDIES[name]
+    kind = _kind_of(name, groups[0].task)
     axis = [float(value) for value in values or kind.values(groups[0].task)]
     points = []
     for group in groups:
@@ -189,7 +225,8 @@ def study_runs(
         for index, value in enumerate(axis):
             means = np.array([rows[index]["metrics"][metric]["mean"] for rows in by_run])
             fewest = min(rows[index]["num_episodes"] for rows in by_run)
-            points.append(StudyPoint(group.label, value, means, fewest))
+            paper = _paper_mean(kind, group, value)
+            points.append(StudyPoint(group.label, value, means, fewest, paper))
     return Study(name, kind.axis, kind.has_log_axis, groups[0].metric, tuple(points), kind.note)
 
 
@@ -377,10 +414,13 @@ def as_csv(study: Study) -> str:
     """One line per setting, value and seed."""
     text = io.StringIO()
     writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(["study", "setting", study.axis, "mean", "std", "num_seeds", "num_episodes"])
+    writer.writerow(
+        ["study", "setting", study.axis, "mean", "std", "num_seeds", "num_episodes", "paper"]
+    )
     for point in study.points:
         numbers = [float(point.means.mean()), float(point.means.std()), len(point.means)]
-        writer.writerow([study.name, point.setting, point.x, *numbers, point.num_episodes])
+        paper = "" if point.paper is None else point.paper
+        writer.writerow([study.name, point.setting, point.x, *numbers, point.num_episodes, paper])
     return text.getvalue()
 
 
@@ -388,14 +428,19 @@ def as_markdown(study: Study) -> str:
     """A row per value, a column per setting."""
     settings = list(dict.fromkeys(point.setting for point in study.points))
     lines = [f"# {study.name}: {study.metric.name.lower()}", ""]
-    lines.append("| " + " | ".join([study.axis, *settings]) + " |")
-    lines.append("|" + " --- |" * (1 + len(settings)))
+    has_paper = any(point.paper is not None for point in study.points)
+    headings = [study.axis, *settings, *(["paper"] if has_paper else [])]
+    lines.append("| " + " | ".join(headings) + " |")
+    lines.append("|" + " --- |" * len(headings))
     for x in dict.fromkeys(point.x for point in study.points):
         cells = [f"{x:g}"]
         for setting in settings:
             (point,) = [p for p in study.points if (p.x, p.setting) == (x, setting)]
             mean, std = study.metric.text(point.means.mean()), study.metric.text(point.means.std())
             cells.append(f"{mean} ± {std}" if len(point.means) > 1 else mean)
+        if has_paper:
+            papers = [p.paper for p in study.points if p.x == x and p.paper is not None]
+            cells.append(study.metric.text(papers[0]) if papers else "-")
         lines.append("| " + " | ".join(cells) + " |")
     seeds = sorted({len(point.means) for point in study.points})
     episodes = sorted({point.num_episodes for point in study.points})
@@ -416,6 +461,11 @@ def study_figure(study: Study) -> Figure:
         error = study.metric.scale * np.array([point.means.std() for point in points])
         x = [point.x for point in points]
         axes.errorbar(x, y, yerr=error, color=color, marker="o", capsize=2.5, label=setting)
+    published = sorted({(p.x, p.paper) for p in study.points if p.paper is not None})
+    if published:
+        places, means = np.array(published).T
+        scaled = study.metric.scale * means
+        axes.plot(places, scaled, color=plots.INK, linestyle="--", marker=".", label="paper")
     if study.has_log_axis:
         axes.set_xscale("log")
     axes.set_ylim(0.0, None)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,16 +14,15 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
+from experiments._machinery import DeviceMachinery, HostMachinery, machinery_of
 from experiments._methods import adapted, file_name, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit
 from jaxnew.checkpoint import Checkpointer, Kind
-from jaxnew.evaluation import Evaluator
-from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
+from jaxnew.ppo import Hyperparameters, PPOConfig, TrainState
 from jaxnew.representation.clusters import balanced_clusters
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.rollout.device import DeviceRollout
 from jaxnew.run_directory import RunDirectory
 from jaxnew.sampling import ActionPool, check_set_size
 from jaxnew.task import LoopConfig, StageTwoBudget, Task
@@ -92,43 +92,52 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Trainer:
-    """The compiled parts of a run.
+    """The compiled parts of a run. Close it at the end.
 
     Attributes:
+      machinery: what trains, inside jit or with environments on the host.
+      learner: its learner.
       pools: actions that evaluations draw sets from, by split.
       training_pool: actions that training draws sets from, or the fixed set.
-      evaluator: with sets as large as in training, for the evaluation after it.
+      evaluator: an `Evaluator` or `HostEvaluator` with sets as large as in training, for the
+        evaluation after it.
       watcher: with sets as large as `LoopConfig` says, for the evaluations during training.
     """
 
     config: TrainConfig
     task: Task
-    learner: Learner
-    evaluator: Evaluator
-    watcher: Evaluator
+    machinery: DeviceMachinery | HostMachinery
+    learner: Any
+    evaluator: Any
+    watcher: Any
     table: jax.Array
     pools: dict[str, ActionPool]
     training_pool: ActionPool
 
     @classmethod
     def of(
-        cls, config: TrainConfig, task: Task, split: ActionSplit, table: RepresentationTable
+        cls,
+        config: TrainConfig,
+        task: Task,
+        split: ActionSplit,
+        table: RepresentationTable,
+        num_workers: int = 0,
     ) -> Trainer:
-        """Builds the parts.
+        """Builds the parts; `num_workers` processes for environments on the host, 0: one per core.
 
         Raises:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
-        env = task.make_environment()
+        action_spec = task.action_spec
         method = method_of(
             config.method,
             task,
             split,
             config.trained_on,
-            action_spec=env.action_spec,
+            action_spec=action_spec,
             conditions_position=config.conditions_position,
         )
-        vectors = table.rows(np.arange(env.action_spec.num_actions))
+        vectors = table.rows(np.arange(action_spec.num_actions))
         rollout_config = config.ppo.rollout
         pools = {
             name: ActionPool.of(
@@ -156,23 +165,14 @@ class Trainer:
             check_set_size(training_pool, rollout_config.set_size, "the train actions")
         for name in SPLITS_WATCHED:
             check_set_size(pools[name], watched_size, f"the {name} actions")
-        evaluator = Evaluator(
-            env,
-            env.default_params,
-            method,
-            rollout_config.set_size,
-            rollout_config.padded_set_size,
-            rollout_config.normalize_observations,
-        )
-        watcher = replace(evaluator, set_size=watched_size, padded_set_size=0)
-        rollout = DeviceRollout(env, env.default_params, method, rollout_config)
-        learner = Learner(rollout, config.ppo)
+        machinery = machinery_of(task, method, config.ppo, config.seed, num_workers)
         return cls(
             config,
             task,
-            learner,
-            evaluator,
-            watcher,
+            machinery,
+            machinery.learner,
+            machinery.evaluator,
+            replace(machinery.evaluator, set_size=watched_size, padded_set_size=0),
             jnp.asarray(vectors),
             pools,
             training_pool,
@@ -180,22 +180,19 @@ class Trainer:
 
     def init(self) -> TrainState:
         """The state before the first update."""
-        key = jax.random.key(self.config.seed)
-        return jax.jit(self.learner.init)(key, self.table, self.training_pool)
+        return self.machinery.init(self.config.seed, self.table, self.training_pool)
 
     def chunk(self, state: TrainState, num_updates: int) -> tuple[TrainState, dict[str, Any]]:
         """`num_updates` updates in one call, and their metrics reduced."""
-        return self._updates(
-            state,
-            self.config.hyperparameters,
-            self.table,
-            self.training_pool,
-            num_updates=num_updates,
+        numbers = self.config.hyperparameters
+        done: tuple[TrainState, dict[str, Any]] = self.machinery.updates(
+            state, numbers, self.table, self.training_pool, num_updates=num_updates
         )
+        return done
 
-    @cached_property
-    def _updates(self) -> Any:
-        return jax.jit(self.learner.updates, static_argnames="num_updates")
+    def close(self) -> None:
+        """Ends the processes of environments on the host."""
+        self.machinery.close()
 
     def evaluate(self, state: TrainState) -> dict[str, float]:
         """Mean episode metrics on train and validation sets, from fixed keys."""
@@ -213,14 +210,14 @@ class Trainer:
             results |= {f"{name}/{metric}": float(v.mean()) for metric, v in episodes.items()}
         return results
 
-    def on_split(self, name: str, evaluator: Evaluator) -> tuple[Evaluator, ActionPool]:
+    def on_split(self, name: str, evaluator: Any) -> tuple[Any, ActionPool]:
         """What evaluates a part of the split: all of the fixed set where training has one."""
         if name == self.config.trained_on and self.config.ppo.rollout.has_fixed_set:
             return self._fixed_evaluator, self.training_pool
         return evaluator, self.pools[name]
 
     @cached_property
-    def _fixed_evaluator(self) -> Evaluator:
+    def _fixed_evaluator(self) -> Any:
         pool = self.training_pool
         return replace(
             self.evaluator,
@@ -245,6 +242,7 @@ def train_policy(
     assignments: list[str] | None = None,
     workdir: Path | None = None,
     overwrite: bool = False,
+    num_workers: int = 0,
 ) -> tuple[Path, loop.LoopResult[TrainState]]:
     """Trains a policy in its run directory, from where it stands to the end.
 
@@ -256,15 +254,18 @@ def train_policy(
     config = config_lib.set_paths(
         TrainConfig.of(domain, method, representation, table, budget, seed), assignments or []
     )
-    trainer = Trainer.of(config, task, domain.split, table)
+    trainer = Trainer.of(config, task, domain.split, table, num_workers)
     name = f"{file_name(method)}-{Path(representation).name.removesuffix('.npz')}"
     path = workdir or domain.folder(runs) / f"{name}-{domain.split_name}-{budget_name}-{seed}"
-    with RunDirectory.open_or_create(
-        path,
-        config_lib.to_dict(config),
-        overwrite,
-        {"split_hash": domain.split.hash, "table_hash": table.hash, "table": table.source},
-    ) as run:
+    provenance = {
+        "split_hash": domain.split.hash,
+        "table_hash": table.hash,
+        "table": table.source,
+    }
+    with (
+        closing(trainer),
+        RunDirectory.open_or_create(path, config_lib.to_dict(config), overwrite, provenance) as run,
+    ):
         save_inputs(run, domain.split, table)
         print(f"Training {name}: {config.num_updates} updates ({budget.cost}) in {path}.")
         result = loop.run(
@@ -296,8 +297,8 @@ def save_inputs(run: RunDirectory, split: ActionSplit, table: RepresentationTabl
         table.save(run.path / TABLE_FILE)
 
 
-def load_trainer(path: Path) -> tuple[RunDirectory, Trainer, ActionSplit]:
-    """A run's config and parts, from its directory alone.
+def load_trainer(path: Path, num_workers: int = 0) -> tuple[RunDirectory, Trainer, ActionSplit]:
+    """A run's config and parts, from its directory alone; see `Trainer.of`.
 
     Raises:
       RunDirectoryError: `path` is not a run of `train`.
@@ -310,13 +311,16 @@ def load_trainer(path: Path) -> tuple[RunDirectory, Trainer, ActionSplit]:
     split.check(task.make_universe())
     table = RepresentationTable.load(path / TABLE_FILE)
     table.check(task.make_universe(), split)
-    return run, Trainer.of(config, task, split, table), split
+    return run, Trainer.of(config, task, split, table, num_workers), split
 
 
 def load_state(run: RunDirectory, trainer: Trainer, kind: Kind) -> tuple[TrainState, int]:
-    """A checkpointed state and the update it was saved at."""
-    example = jax.eval_shape(
-        trainer.learner.init, jax.random.key(0), trainer.table, trainer.training_pool
-    )
-    state, _ = Checkpointer(run.checkpoints).restore(kind, example)
+    """A checkpointed state and the update it was saved at.
+
+    Of a domain on the host without its environments: it is there to be evaluated.
+    """
+    machinery = trainer.machinery
+    example = machinery.example(trainer.table, trainer.training_pool)
+    checkpointer = Checkpointer(run.checkpoints)
+    state, _ = checkpointer.restore(kind, example, is_part=not machinery.restores_whole_state)
     return state, int(state.step)

@@ -31,7 +31,9 @@ from experiments._studies import (
     study_runs,
 )
 
-STUDY = flags.DEFINE_enum("study", None, [*STUDIES, *GRIDS], "What to study.")
+STUDY = flags.DEFINE_string(
+    "study", None, f"What to study: {', '.join([*STUDIES, *GRIDS])}, or one of the task's own."
+)
 RUN = flags.DEFINE_list("run", [], "Runs of train or sweep to evaluate.")
 ENCODER = flags.DEFINE_string("encoder", None, "Run of embed, for --study=recordings.")
 VALUES = flags.DEFINE_list("values", [], "Values of the horizontal axis; default: the study's.")

@@ -9,6 +9,7 @@ python -m experiments.evaluate --run=RUN --unseen_ratio=0.4
 from __future__ import annotations
 
 import dataclasses
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -44,27 +45,28 @@ def main() -> None:
         raise flag.UsageError("Say which run to evaluate: --run=DIRECTORY.")
     path, kind = locate(Path(RUN.value))
     kind = kind or CHECKPOINT.value
-    run, trainer, split = load_trainer(path)
+    run, trainer, split = load_trainer(path, flag.WORKERS.value)
     if TABLE.value is not None:
         new = RepresentationTable.load(Path(TABLE.value))
         trainer = dataclasses.replace(trainer, table=with_new_rows(trainer.table, new))
     state, step = load_state(run, trainer, kind)
     rows = {}
-    for name, ids in action_lists(trainer.task.make_universe(), split).items():
-        rows[name] = evaluate_on(
-            trainer,
-            state,
-            name,
-            ids,
-            split,
-            num_episodes=EPISODES.value,
-            set_size=SET_SIZE.value,
-            first_size=GROWS_FROM.value,
-            growth=GROWTH.value,
-            deterministic=DETERMINISTIC.value,
-            seed=EVALUATION_KEY.value,
-        )
-        record(run, name, kind, step, rows[name])
+    with closing(trainer):
+        for name, ids in action_lists(trainer.task.make_universe(), split).items():
+            rows[name] = evaluate_on(
+                trainer,
+                state,
+                name,
+                ids,
+                split,
+                num_episodes=EPISODES.value,
+                set_size=SET_SIZE.value,
+                first_size=GROWS_FROM.value,
+                growth=GROWTH.value,
+                deterministic=DETERMINISTIC.value,
+                seed=EVALUATION_KEY.value,
+            )
+            record(run, name, kind, step, rows[name])
     print_table(rows, f"{path}, {kind} checkpoint (update {step})")
 
 

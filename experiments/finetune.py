@@ -12,6 +12,7 @@ running statistics of observations are kept and frozen. `--scratch` keeps nothin
 from __future__ import annotations
 
 import dataclasses
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -61,13 +62,17 @@ def main() -> None:
         ),
         flag.SET.value,
     )
-    trainer = Trainer.of(config, source.task, split, table)
+    trainer = Trainer.of(config, source.task, split, table, flag.WORKERS.value)
     state = trainer.init()
     if not SCRATCH.value:
         state = warm_start(state, load_state(source_run, source, "best")[0], trainer)
     name = f"finetune-{'scratch' if SCRATCH.value else 'warm'}-{flag.BUDGET.value}-{config.seed}"
     path = Path(flag.WORKDIR.value) if flag.WORKDIR.value else source_path / name
-    with RunDirectory.open_or_create(path, config_lib.to_dict(config), flag.OVERWRITE.value) as run:
+    plain = config_lib.to_dict(config)
+    with (
+        closing(trainer),
+        RunDirectory.open_or_create(path, plain, flag.OVERWRITE.value) as run,
+    ):
         save_inputs(run, split, table)
         print(f"{name}: {config.num_updates} updates with {_PART} actions in {path}.")
         metric = source.task.selection_metric
@@ -124,12 +129,9 @@ def warm_start(state: TrainState, source: TrainState, trainer: Trainer) -> Train
     params: dict[str, Any] = jax.tree.map(lambda x: x, source.params)
     if "policy" in params and "logits" in params["policy"]:
         params["policy"] = {**params["policy"], "logits": state.params["policy"]["logits"]}
-    rollout = jax.jit(trainer.learner.rollout.init)(
-        jax.random.fold_in(state.key, 0),
-        trainer.training_pool,
-        source.rollout.observation_statistics,
-    )
-    return dataclasses.replace(state, params=params, rollout=rollout)
+    state = dataclasses.replace(state, params=params)
+    statistics = source.rollout.observation_statistics
+    return trainer.machinery.restarted(state, trainer.training_pool, statistics)
 
 
 if __name__ == "__main__":

@@ -235,6 +235,12 @@ def main() -> None:
     num_cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
     jax.config.update("jax_num_cpu_devices", num_cores)
     task = flag.load_task(flag.TASK.value)
+    if task.host is not None:
+        raise flag.UsageError(
+            f"The environments of {task.name} run on the host, so its runs cannot be one program. "
+            "Run `python -m experiments.train` once per --seed, with "
+            "--set=hyperparameters.NAME=VALUE for what is to vary."
+        )
     domain = Domain.of(task, flag.SPLIT.value)
     runs = Path(flag.RUNS.value)
     budget = flag.budget_of(task.stage_two, flag.BUDGET.value, "Stage two")

@@ -40,6 +40,7 @@ def main() -> None:
         assignments=flag.SET.value,
         workdir=Path(flag.WORKDIR.value) if flag.WORKDIR.value else None,
         overwrite=flag.OVERWRITE.value,
+        num_workers=flag.WORKERS.value,
     )
 
 

@@ -112,7 +112,7 @@ class Checkpointer:
         return self._path(kind, step)
 
     def restore(
-        self, kind: Kind, example: State, step: int | None = None
+        self, kind: Kind, example: State, step: int | None = None, *, is_part: bool = False
     ) -> tuple[State, dict[str, Any]]:
         """Reads the newest readable checkpoint of a kind.
 
@@ -121,6 +121,7 @@ class Checkpointer:
           example: a state of the same structure, shapes and dtypes; concrete, or made of
             `jax.ShapeDtypeStruct`. Arrays are placed where those of `example` are.
           step: read this one only, instead of the newest.
+          is_part: `example` may lack leaves of the saved state, which are left out.
 
         Returns:
           (state, metadata): the state with the bits that were saved.
@@ -128,7 +129,7 @@ class Checkpointer:
         Raises:
           CheckpointError: none is readable, or the newest holds another structure.
         """
-        found = self._newest(kind, step, lambda path: self._read(path, example))
+        found = self._newest(kind, step, lambda path: self._read(path, example, is_part))
         return cast(tuple[State, dict[str, Any]], found)
 
     def metadata(self, kind: Kind, step: int | None = None) -> dict[str, Any]:
@@ -189,11 +190,13 @@ class Checkpointer:
             )
         return cast(dict[str, Any], record)
 
-    def _read(self, path: Path, example: Any) -> tuple[Any, dict[str, Any]]:
+    def _read(self, path: Path, example: Any, is_part: bool) -> tuple[Any, dict[str, Any]]:
         record = self._read_record(path)
         leaves, saved = _leaves.named_leaves(example), record["leaves"]
+        names = {name for name, _ in leaves}
         difference = _leaves.first_difference(
-            saved, [_leaves.describe(name, leaf) for name, leaf in leaves]
+            [leaf for leaf in saved if not is_part or leaf["path"] in names],
+            [_leaves.describe(name, leaf) for name, leaf in leaves],
         )
         if difference is not None:
             raise CheckpointError(

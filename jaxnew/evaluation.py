@@ -47,11 +47,12 @@ class Evaluator:
     width: int = 128
 
     def __post_init__(self) -> None:
-        if not 0 <= self.first_size <= self.set_size or self.growth < 0:
-            raise ValueError(
-                f"first_size={self.first_size} must be in 0..{self.set_size} (the set size) and "
-                f"growth={self.growth} at least 0."
-            )
+        check_growth(self.first_size, self.growth, self.set_size)
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Length of the longest episode."""
+        return self.env.max_episode_steps(self.env_params)
 
     def run(
         self,
@@ -135,15 +136,12 @@ class Evaluator:
         names = (*self.env.episode_metrics, "num_steps")
         zeros = {name: jnp.zeros(self.width) for name in names}
         carry = (obs, state, jnp.zeros(self.width, bool), zeros)
-        num_steps = self.env.max_episode_steps(self.env_params)
-        (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(num_steps))
+        (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(self.max_episode_steps))
         return metrics
 
     def _available_at(self, available: AvailableSet, t: jax.Array) -> AvailableSet:
         """What may be chosen at step `t`: sets are in random order, so a beginning is a set too."""
-        if self.first_size == 0:
-            return available
-        is_there = jnp.arange(available.ids.shape[-1]) < self.first_size + self.growth * t
+        is_there = is_there_at(self.first_size, self.growth, t, available.ids.shape[-1])
         return AvailableSet(available.ids, available.mask & is_there)
 
     @staticmethod
@@ -158,6 +156,21 @@ class Evaluator:
     @cached_property
     def _play_greedy(self) -> Any:
         return jax.jit(partial(self.play_block, deterministic=True))
+
+
+def check_growth(first_size: int, growth: int, set_size: int) -> None:
+    """Raises ValueError unless sets can grow so; see `Evaluator`."""
+    if not 0 <= first_size <= set_size or growth < 0:
+        raise ValueError(
+            f"first_size={first_size} must be in 0..{set_size} (the set size) and "
+            f"growth={growth} at least 0."
+        )
+
+
+def is_there_at(first_size: int, growth: int, t: Any, width: int) -> Any:
+    """bool[..., width] what is there at step t int[...] of a growing set; see `Evaluator`."""
+    t = t[..., None]
+    return (np.arange(width) < first_size + growth * t) | (first_size == 0)
 
 
 def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, float | str]]:

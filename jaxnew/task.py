@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from functools import partial
+from typing import Protocol
 
+import jax
 import numpy as np
 
 from jaxnew.actions import ActionSplit, ActionUniverse
-from jaxnew.environment import Environment
+from jaxnew.environment import ActionSpec, Environment, ObservationSpec
 from jaxnew.observations import RecordBlock, RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
+from jaxnew.rollout.pool import HostEnvironments, HostPool
 
 
 @dataclass(frozen=True)
@@ -99,13 +104,35 @@ class Baselines:
       sums_gaussian_entropy: its entropy is summed over dimensions instead of averaged.
       fixed_set: `ids -> ids` of the one set that the utility policy scores where it is trained
         without subsampling.
+      fixed_set_minibatches: minibatches per pass of the utility policy without subsampling; 0 for
+        as many as with it.
       finetune_share: updates of fine-tuning on new actions over those of training (spec method 9).
     """
 
     continuous_rollout_share: float = 1.0
     sums_gaussian_entropy: bool = False
     fixed_set: Callable[[np.ndarray], np.ndarray] = lambda ids: ids
+    fixed_set_minibatches: int = 0
     finetune_share: float = 1.0
+
+
+@dataclass(frozen=True)
+class ActionStudy:
+    """Pools of actions that a trained policy is evaluated on, from easy to hard.
+
+    Attributes:
+      axis: what `values` are.
+      values: the paper's.
+      ids: `(table f32[A, d], value) -> int32[n]` actions that sets are drawn from.
+      note: the rule, for readers of the table.
+      paper_method: `value ->` name of the row in the paper's results, or None if it has none.
+    """
+
+    axis: str
+    values: tuple[float, ...]
+    ids: Callable[[np.ndarray, float], np.ndarray]
+    note: str
+    paper_method: Callable[[float], str] | None = None
 
 
 @dataclass(frozen=True)
@@ -121,33 +148,111 @@ class Measured:
     evaluation: float
 
 
+class MakePool(Protocol):
+    """Makes a pool of host environments; numbers must not depend on halves and workers."""
+
+    def __call__(
+        self, *, num_envs: int, num_halves: int, num_workers: int, seed: int
+    ) -> HostPool: ...
+
+
+@dataclass(frozen=True)
+class HostDomain:
+    """Environments that run on the host, in a pool.
+
+    Attributes:
+      make_pool: a pool; see `MakePool` and `jaxnew.rollout.pool.HostPool`.
+      action_spec: of the actions; there is no stop bit.
+      observation_spec: of one observation of the pool. `uint8[height, width]` are frames, which the
+        policy sees as stacks; other shapes it sees as they are.
+      max_episode_steps: length of the longest episode.
+      stack_size: frames in a stack.
+
+    Raises:
+      ValueError: the actions have a stop bit.
+    """
+
+    make_pool: MakePool
+    action_spec: ActionSpec
+    observation_spec: ObservationSpec
+    max_episode_steps: int
+    stack_size: int = 1
+
+    def __post_init__(self) -> None:
+        if self.action_spec.has_stop:
+            raise ValueError("Actions of host environments are ids and positions, without a stop.")
+
+    @property
+    def policy_observation(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of one observation as the policy sees it."""
+        shape = self.observation_spec.shape
+        if len(shape) == 2:
+            shape = (*shape, self.stack_size)
+        return jax.ShapeDtypeStruct(shape, self.observation_spec.dtype)
+
+    def environments(self, num_envs: int, seed: int, num_workers: int = 0) -> HostEnvironments:
+        """A pool in two halves where that is possible, made when first needed.
+
+        Args:
+          num_envs: N.
+          seed: of the training episodes.
+          num_workers: processes; 0 for one per core. At most one for each environment of a half.
+        """
+        num_halves = 1 if num_envs % 2 else 2
+        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+        num_workers = min(num_workers or cores or 1, num_envs // num_halves)
+        make = partial(
+            self.make_pool,
+            num_envs=num_envs,
+            num_halves=num_halves,
+            num_workers=num_workers,
+            seed=seed,
+        )
+        return HostEnvironments(make, self.max_episode_steps, self.stack_size)
+
+
+def _no_environment() -> Environment:
+    raise ValueError(
+        "The environments of this task run on the host, and what was asked for needs one that runs "
+        "inside jit. train, evaluate and finetune work with either."
+    )
+
+
 @dataclass(frozen=True)
 class Task:
     """A domain. Modules in `experiments/tasks/` define one called `TASK`.
 
     Attributes:
       name: of the folder of its runs, and for a task of `experiments/tasks` what `--task` takes.
-      make_environment: the environment, made when first needed.
       make_universe: all its actions.
       splits: named ways to split the universe, each from a seed; the first is the default.
       split_seed: seed of the splits; one for the project, so that all runs share them.
       play: recordings of actions, or None for a domain whose representations are given.
       stage_one, stage_two: presets by budget.
+      make_environment: the environment where it runs inside jit, made when first needed; else
+      host: the environments on the host.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
       baselines: settings of the paper's baselines.
       measured: speeds, or None where nobody measured them.
       paper_environment: name of the domain in the paper's results, or None.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
+      studies: what `analyze` offers for this task beside what it offers for every one.
+      actions_name: folder of recordings and encoders, for tasks that share their actions and play;
+        also a name that `--task` takes for one of them. None for a task with its own.
       place: `package.module:NAME` that the task was loaded from, or None for one of
         `experiments/tasks`; filled in by whoever loads it.
+
+    Raises:
+      ValueError: there is not exactly one of `make_environment` and `host`.
     """
 
     name: str
-    make_environment: Callable[[], Environment]
     make_universe: Callable[[], ActionUniverse]
     splits: Mapping[str, Callable[[ActionUniverse, int], ActionSplit]]
     stage_two: Mapping[str, StageTwoBudget]
+    make_environment: Callable[[], Environment] = _no_environment
+    host: HostDomain | None = None
     play: Play | None = None
     stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
     split_seed: int = 0
@@ -156,7 +261,20 @@ class Task:
     measured: Measured | None = None
     paper_environment: str | None = None
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+    studies: Mapping[str, ActionStudy] = field(default_factory=dict)
+    actions_name: str | None = None
     place: str | None = None
+
+    def __post_init__(self) -> None:
+        if (self.host is None) == (self.make_environment is _no_environment):
+            raise ValueError(f"Task {self.name} needs one of make_environment and host.")
+
+    @property
+    def action_spec(self) -> ActionSpec:
+        """What an action of the domain consists of."""
+        if self.host is not None:
+            return self.host.action_spec
+        return self.make_environment().action_spec
 
     @property
     def reference(self) -> str:

@@ -24,16 +24,16 @@ LAYERS = (
     {"sampling", "environment"},
     {"policy", "representation"},
     {"rollout", "ppo"},
-    {"loop", "evaluation"},
+    {"loop", "evaluation", "host_evaluation"},
     {"task"},
 )
-SIDEWAYS = {("ppo", "rollout")}
+SIDEWAYS = {("ppo", "rollout"), ("host_evaluation", "evaluation")}
 
 HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
     "mujoco": {"envs_mjx.shape_stacking"},
 }
-HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "jaxnew.actions"}
+HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "PIL", "jaxnew.actions"}
 
 
 def module_name(path: Path, root: Path = ROOT) -> str:

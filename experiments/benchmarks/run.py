@@ -15,11 +15,14 @@ from experiments.benchmarks import _measure as m
 SUBJECTS = (
     "environment",
     "utility",
+    "images",
     "training",
     "methods",
     "evaluation",
     "representation",
     "sweep",
+    "pool",
+    "create",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 

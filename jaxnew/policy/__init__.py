@@ -1,7 +1,14 @@
 """Stage 2: what acts. A policy scores any list of action representations."""
 
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.method import METHODS, PolicyMethod, make_method
+from jaxnew.policy.method import METHODS, PolicyMethod, distribution_and_value, make_method
 from jaxnew.policy.utility import UtilityMethod
 
-__all__ = ["METHODS", "Categorical", "PolicyMethod", "UtilityMethod", "make_method"]
+__all__ = [
+    "METHODS",
+    "Categorical",
+    "PolicyMethod",
+    "UtilityMethod",
+    "distribution_and_value",
+    "make_method",
+]

@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action, ActionSpec
+from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Beta, Categorical
 from jaxnew.policy.state_encoder import FEATURE_SIZE, apply, orthogonal_dense
 from jaxnew.policy.utility import HIDDEN_SIZE, UtilityMethod
@@ -172,7 +173,7 @@ class _ConditionedHead(nn.Module):
         return 1.0 + nn.softplus(self.out(nn.relu(hidden)))
 
 
-class AuxiliaryMethod:
+class AuxiliaryMethod(FeatureMethod):
     """A method with heads for the position and the stop bit of a hybrid domain.
 
     The heads read the state feature of the method; its parameters stand beside theirs.
@@ -201,7 +202,7 @@ class AuxiliaryMethod:
         self._conditioned = _ConditionedHead(dim)
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
-        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_base, key_heads, key_alpha, key_beta = jax.random.split(key, 4)
         feature = jnp.zeros(FEATURE_SIZE)
         auxiliary = {"heads": self._heads.init(key_heads, feature).get("params", {})}
@@ -224,11 +225,15 @@ class AuxiliaryMethod:
         ]
         return jnp.concatenate([projected, *shares], axis=-1)
 
-    def distribution(
-        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature of the method."""
+        features: jax.Array = self._base.features(params, obs)
+        return features
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> HybridDistribution:
         """The joint distribution; see the method's own."""
-        features = self._base.features(params, obs)
         rows = projected[..., :HIDDEN_SIZE] if self._is_conditioned else projected
         choice = self._base.distribution_of(params, features, rows, mask)
         heads: Any = self._heads.apply({"params": params["auxiliary"]["heads"]}, features)
@@ -242,9 +247,9 @@ class AuxiliaryMethod:
             position = Beta(alpha, beta)
         return HybridDistribution(choice, stop, position, self._is_conditioned)
 
-    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[...] value of f32[..., n] normalised observations."""
-        value: jax.Array = self._base.value(params, obs)
+    def value_of(self, params: dict[str, Any], obs: jax.Array, features: jax.Array) -> jax.Array:
+        """f32[...] the method's value."""
+        value: jax.Array = self._base.value_of(params, obs, features)
         return value
 
     def decode(self, sample: HybridSample, available: AvailableSet, table: jax.Array) -> Action:

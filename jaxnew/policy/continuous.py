@@ -10,8 +10,9 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action
+from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy._nearest import nearest_id
-from jaxnew.policy.state_encoder import VectorCritic, VectorEncoder, apply, orthogonal_dense
+from jaxnew.policy.state_encoder import StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
 _LOG_TWO_PI = 1.8378770664093453
@@ -55,12 +56,12 @@ class DiagonalGaussian:
 
 
 class _GaussianPolicy(nn.Module):
-    """Observation f32[..., n] -> mean and variance, f32[..., d] each."""
+    """Observation -> mean and variance, f32[..., d] each."""
 
     size: int
 
     def setup(self) -> None:
-        self.encoder = VectorEncoder()
+        self.encoder = StateEncoder()
         self.mean = orthogonal_dense(self.size, 1.0)
         self.variance = orthogonal_dense(self.size, 1.0)
 
@@ -74,33 +75,26 @@ class _GaussianPolicy(nn.Module):
         return self.output(self.features(obs))
 
 
-class ContinuousMethod:
+class ContinuousMethod(FeatureMethod):
     """Samples a point; the nearest available action is taken. PPO runs on the point."""
 
     name = "continuous"
 
     def __init__(self, sums_entropy: bool = False) -> None:
         self._sums_entropy = sums_entropy
-        self._critic = VectorCritic()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
-        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_policy, key_critic = jax.random.split(key)
         return {
             "policy": _GaussianPolicy(representation_size).init(key_policy, obs)["params"],
-            "critic": self._critic.init(key_critic, obs)["params"],
+            "critic": self.init_critic(key_critic, obs),
         }
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """The representations themselves."""
         del params
         return representations
-
-    def distribution(
-        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> DiagonalGaussian:
-        """The policy over points f32[..., d]; it does not see the available actions."""
-        return self.distribution_of(params, self.features(params, obs), projected, mask)
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[..., 64] the state feature."""
@@ -114,10 +108,6 @@ class ContinuousMethod:
         policy = _GaussianPolicy(projected.shape[-1])
         both = apply(policy, params["policy"], features, method="output")
         return DiagonalGaussian(both[0], both[1], self._sums_entropy)
-
-    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[...] value of f32[..., n] normalised observations."""
-        return apply(self._critic, params["critic"], obs)
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The available action nearest to each point."""

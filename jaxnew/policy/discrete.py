@@ -10,21 +10,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.environment import Action
+from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy._nearest import nearest_id
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import VectorCritic, VectorEncoder, apply, orthogonal_dense
+from jaxnew.policy.state_encoder import StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
 _HEAD_GAIN = 0.01  # Spec method 8.2.
 
 
 class _DiscretePolicy(nn.Module):
-    """Observation f32[..., n] -> logits f32[..., num_actions]."""
+    """Observation -> logits f32[..., num_actions]."""
 
     num_actions: int
 
     def setup(self) -> None:
-        self.encoder = VectorEncoder()
+        self.encoder = StateEncoder()
         self.logits = orthogonal_dense(self.num_actions, _HEAD_GAIN)
 
     def features(self, obs: jax.Array) -> jax.Array:
@@ -37,7 +38,7 @@ class _DiscretePolicy(nn.Module):
         return self.output(self.features(obs))
 
 
-class DiscreteMethod:
+class DiscreteMethod(FeatureMethod):
     """One logit per train action. Its sample is an index into `train_ids`.
 
     What acts is the available action whose representation is nearest to that of the sampled train
@@ -54,27 +55,20 @@ class DiscreteMethod:
             raise ValueError("The discrete method needs the ids of the actions it is trained on.")
         self._train_ids = np.asarray(train_ids, np.int32)
         self._policy = _DiscretePolicy(len(train_ids))
-        self._critic = VectorCritic()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
-        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        """Fresh parameters for an observation like `obs`; consumes `key`."""
         del representation_size
         key_policy, key_critic = jax.random.split(key)
         return {
             "policy": self._policy.init(key_policy, obs)["params"],
-            "critic": self._critic.init(key_critic, obs)["params"],
+            "critic": self.init_critic(key_critic, obs),
         }
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """The representations themselves."""
         del params
         return representations
-
-    def distribution(
-        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> Categorical:
-        """The policy over the train actions; it does not see the available ones."""
-        return self.distribution_of(params, self.features(params, obs), projected, mask)
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[..., 64] the state feature."""
@@ -86,10 +80,6 @@ class DiscreteMethod:
         """`distribution` from the state feature f32[..., 64]."""
         del projected, mask
         return Categorical(apply(self._policy, params["policy"], features, method="output"))
-
-    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[...] value of f32[..., n] normalised observations."""
-        return apply(self._critic, params["critic"], obs)
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The available action nearest to the sampled train action."""

@@ -44,6 +44,9 @@ class PolicyMethod(Protocol):
 
     `decode` turns a sample into an action of the available set; `table` f32[A, d] holds the
     representations of all actions, for methods whose sample is not a choice from the set.
+
+    A method whose distribution and value share work may have `distribution_and_value` as well, with
+    the arguments of `distribution`.
     """
 
     name: str
@@ -59,6 +62,17 @@ class PolicyMethod(Protocol):
     def value(self, params: Params, obs: jax.Array) -> jax.Array: ...
 
     def decode(self, sample: Any, available: AvailableSet, table: jax.Array) -> Action: ...
+
+
+def distribution_and_value(
+    method: PolicyMethod, params: Params, obs: jax.Array, projected: jax.Array, mask: jax.Array
+) -> tuple[Distribution, jax.Array]:
+    """`method.distribution` and `method.value`, with what they share computed once if it can be."""
+    joint = getattr(method, "distribution_and_value", None)
+    if joint is not None:
+        found: tuple[Distribution, jax.Array] = joint(params, obs, projected, mask)
+        return found
+    return method.distribution(params, obs, projected, mask), method.value(params, obs)
 
 
 @dataclass(frozen=True)

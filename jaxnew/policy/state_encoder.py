@@ -1,15 +1,41 @@
-"""State features and values for vector observations (spec method 5.2)."""
+"""State features and values (spec method 5.2), for vectors and for images.
+
+Which of the two an observation is shows in its dtype: `uint8` is an image. Images stay `uint8` in
+rollouts and are divided by 255 here.
+"""
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
 from typing import Any, cast
 
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
+
+from jaxnew._convolution import WINDOW, convolution
 
 FEATURE_SIZE = 64  # Width of the state feature f(s).
 _SQRT_2 = float(np.sqrt(2.0))
+_CHANNELS = (16, 16, 32, 32, 32)
+
+
+def is_image(obs: jax.Array) -> bool:
+    """Whether observations are images `uint8[..., height, width, channels]`.
+
+    Raises:
+      ValueError: they are `uint8`, but have no such axes.
+    """
+    if obs.dtype != jnp.uint8:
+        return False
+    if obs.ndim < 3:
+        raise ValueError(
+            f"uint8 observations are images [..., height, width, channels], got {obs.shape}; give "
+            "observations that are vectors as float32."
+        )
+    return True
 
 
 def orthogonal_dense(features: int, gain: float, name: str | None = None) -> nn.Dense:
@@ -17,21 +43,89 @@ def orthogonal_dense(features: int, gain: float, name: str | None = None) -> nn.
     return nn.Dense(features, kernel_init=nn.initializers.orthogonal(gain), name=name)
 
 
+class StridedConvolution(nn.Module):
+    """A 3x3 convolution with stride 2, padding 1 and a bias; PyTorch's default initialisation.
+
+    Weights and bias are uniform in +-1/sqrt(9 C) (spec method 5.2).
+
+    Attributes:
+      features: O.
+      form: of `jaxnew._convolution`.
+    """
+
+    features: int
+    form: Callable[[jax.Array, jax.Array, int], jax.Array] = convolution
+
+    @nn.compact
+    def __call__(self, x: jax.Array) -> jax.Array:
+        """f32[B, H, W, C] -> f32[B, H', W', O]."""
+        num_inputs = WINDOW**2 * x.shape[-1]
+        bound = 1.0 / math.sqrt(num_inputs)
+
+        def init(key: jax.Array, shape: tuple[int, ...]) -> jax.Array:
+            return jax.random.uniform(key, shape, jnp.float32, -bound, bound)
+
+        kernel = self.param("kernel", init, (WINDOW, WINDOW, x.shape[-1], self.features))
+        bias = self.param("bias", init, (self.features,))
+        return self.form(x, kernel, 2) + bias
+
+
+class ImageEncoder(nn.Module):
+    """Five convolutions and a dense layer, ReLU after each: uint8[..., H, W, C] -> f32[..., 64].
+
+    84x84 images become 42, 21, 11, 6, 3 pixels wide: 288 numbers. They are flattened as rows,
+    columns, channels (the original's PyTorch: channels, rows, columns), which permutes the rows of
+    the dense layer's weight and changes nothing else.
+
+    Attributes:
+      form: of the convolutions, see `jaxnew._convolution`.
+    """
+
+    form: Callable[[jax.Array, jax.Array, int], jax.Array] = convolution
+
+    @nn.compact
+    def __call__(self, obs: jax.Array) -> jax.Array:
+        x = obs.reshape(-1, *obs.shape[-3:]).astype(jnp.float32) / 255.0
+        for index, channels in enumerate(_CHANNELS):
+            x = nn.relu(StridedConvolution(channels, self.form, name=f"convolution_{index}")(x))
+        x = x.reshape(*obs.shape[:-3], -1)
+        return nn.relu(orthogonal_dense(FEATURE_SIZE, _SQRT_2, "dense")(x))
+
+
+def _vector_features(obs: jax.Array) -> jax.Array:
+    """Makes its two layers in the module that calls it."""
+    x = nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(obs))
+    return nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(x))
+
+
 class VectorEncoder(nn.Module):
     """`dense 64, tanh, dense 64, tanh`: f32[..., n] -> f32[..., 64]."""
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        x = nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(obs))
-        return nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(x))
+        return _vector_features(obs)
 
 
-class VectorCritic(nn.Module):
-    """An encoder of its own and `dense 1`: f32[..., n] -> f32[...]. Blind to the action set."""
+class StateEncoder(nn.Module):
+    """The state feature f(s): f32[..., n] or uint8[..., H, W, C] -> f32[..., 64]."""
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return orthogonal_dense(1, _SQRT_2, "value")(VectorEncoder()(obs))[..., 0]
+        return ImageEncoder(name="image")(obs) if is_image(obs) else _vector_features(obs)
+
+
+class StateCritic(nn.Module):
+    """The value f32[...] of a state. Blind to the action set.
+
+    Of vectors by an encoder of its own; of images from the state feature of the policy, which its
+    gradient reaches (spec method 5.2).
+    """
+
+    @nn.compact
+    def __call__(self, obs: jax.Array, features: jax.Array) -> jax.Array:
+        """Values of observations [..., n] or [..., H, W, C] with features f32[..., 64]."""
+        hidden = features if is_image(obs) else VectorEncoder()(obs)
+        return orthogonal_dense(1, _SQRT_2, "value")(hidden)[..., 0]
 
 
 def apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:

@@ -20,8 +20,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxnew.environment import Action
+from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorCritic, VectorEncoder, apply
+from jaxnew.policy.state_encoder import FEATURE_SIZE, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 HIDDEN_SIZE = 64
@@ -62,22 +63,21 @@ class Utility(nn.Module):
         return self.score(nn.relu(hidden))[..., 0]
 
 
-class UtilityMethod:
+class UtilityMethod(FeatureMethod):
     """Ours: a softmax over the utilities of the available actions. Its sample is the choice."""
 
     name = "ours"
 
     def __init__(self) -> None:
-        self._encoder = VectorEncoder()
-        self._critic = VectorCritic()
+        self._encoder = StateEncoder()
         self._utility = Utility()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
-        """Fresh parameters for observations like `obs` (f32[n]); consumes `key`."""
+        """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_encoder, key_critic, key_utility = jax.random.split(key, 3)
         return {
             "encoder": self._encoder.init(key_encoder, obs)["params"],
-            "critic": self._critic.init(key_critic, obs)["params"],
+            "critic": self.init_critic(key_critic, obs),
             "utility": self._utility.init(
                 key_utility,
                 jnp.zeros(FEATURE_SIZE),
@@ -90,19 +90,6 @@ class UtilityMethod:
         """f32[..., d] -> f32[..., 64]: all that the policy needs of an action, in any state."""
         return apply(self._utility, params["utility"], representations, method="project")
 
-    def distribution(
-        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> Categorical:
-        """The policy over the available actions.
-
-        Args:
-          params: as `init` makes them.
-          obs: f32[..., n] normalised observations.
-          projected: f32[..., m, 64] `project` of the available representations.
-          mask: bool[..., m] true for a real entry of the set.
-        """
-        return self.distribution_of(params, self.features(params, obs), projected, mask)
-
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[..., 64] the state feature `f(s)`."""
         return apply(self._encoder, params["encoder"], obs)
@@ -110,17 +97,20 @@ class UtilityMethod:
     def distribution_of(
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Categorical:
-        """`distribution` from the state feature f32[..., 64]."""
+        """The policy over the available actions.
+
+        Args:
+          params: as `init` makes them.
+          features: f32[..., 64] state features.
+          projected: f32[..., m, 64] `project` of the available representations.
+          mask: bool[..., m] true for a real entry of the set.
+        """
         utilities = apply(self._utility, params["utility"], features, projected)
         return Categorical.masked(utilities, mask)
 
     def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., 64]: the `a` of the module docstring."""
         return apply(self._utility, params["utility"], representations, method="embedded")
-
-    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[...] value of f32[..., n] normalised observations."""
-        return apply(self._critic, params["critic"], obs)
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The action behind a choice int32[...] from sets [..., m]."""

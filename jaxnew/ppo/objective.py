@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-from jaxnew.policy import PolicyMethod
+from jaxnew.policy import PolicyMethod, distribution_and_value
 from jaxnew.sampling import AvailableSet
 
 
@@ -38,7 +38,7 @@ class Minibatch:
     """Transitions to learn from; every field is `[B, ...]`.
 
     Attributes:
-      observation: f32[B, ...] normalised.
+      observation: f32[B, ...] normalised, or uint8[B, H, W, C] images.
       available: sets [B, m], or None where one set is in force in all of them.
       sample: what the policy drew, a pytree.
       log_prob: f32[B] its log-probability then.
@@ -90,7 +90,9 @@ def loss(
     if available is None:
         raise ValueError("The minibatch has no sets, and no fixed set is given.")
     rows = projected if minibatch.available is None else projected[available.ids]
-    distribution = method.distribution(params, minibatch.observation, rows, available.mask)
+    distribution, value = distribution_and_value(
+        method, params, minibatch.observation, rows, available.mask
+    )
     log_ratio = distribution.log_prob(minibatch.sample) - minibatch.log_prob
     ratio = jnp.exp(log_ratio)
     clip = hyperparameters.clip
@@ -100,7 +102,6 @@ def loss(
             jnp.clip(ratio, 1.0 - clip, 1.0 + clip) * minibatch.advantage,
         )
     )
-    value = method.value(params, minibatch.observation)
     clipped_value = minibatch.value + jnp.clip(value - minibatch.value, -clip, clip)
     value_loss = 0.5 * jnp.mean(
         jnp.maximum(

@@ -15,6 +15,7 @@ _HOMES = {
     "RepresentationState": "jaxnew.representation.learner",
     "RepresentationTable": "jaxnew.representation.table",
     "engineered_table": "jaxnew.representation.table",
+    "image_modality": "jaxnew.representation.modality",
     "one_hot_modality": "jaxnew.representation.modality",
     "vector_modality": "jaxnew.representation.modality",
 }

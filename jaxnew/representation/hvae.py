@@ -10,14 +10,19 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew.representation.decoders import DecoderStart, TrajectoryDecoder
+from jaxnew.representation.decoders import DecoderStart
 from jaxnew.representation.encoders import (
     Dense,
     LatentHead,
     ResBlock,
     ScalarBatchNorm,
-    TrajectoryEncoder,
     likelihood_log_variance,
+)
+from jaxnew.representation.images import (
+    decoded,
+    encoded,
+    recording_decoder,
+    recording_encoder,
 )
 from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
 
@@ -83,7 +88,7 @@ class LatentPrior(nn.Module):
 
 
 class HVAE(nn.Module):
-    """The hierarchical VAE for trajectories.
+    """The hierarchical VAE for trajectories, videos and still images.
 
     Attributes:
       encoder_width: E.
@@ -93,6 +98,8 @@ class HVAE(nn.Module):
       observation_latent: dz.
       gaussian_dim: D for a Gaussian likelihood, whose log-variance is a free vector of that length;
         0 for a categorical one, which has no variance.
+      image_shape: (side, side, channels) where a step of a recording is an image, else None.
+      is_still: whether a recording is one image.
     """
 
     encoder_width: int
@@ -101,16 +108,18 @@ class HVAE(nn.Module):
     action_latent: int
     observation_latent: int
     gaussian_dim: int
+    image_shape: tuple[int, int, int] | None = None
+    is_still: bool = False
 
     def setup(self) -> None:
-        self.encoder = TrajectoryEncoder(self.encoder_width)
+        self.encoder = recording_encoder(self.encoder_width, self.image_shape)
         self.action_inference = ActionInference(self.inference_width, self.action_latent)
         self.observation_inference = ObservationInference(
             self.hidden_width, self.observation_latent
         )
         self.latent_prior = LatentPrior(self.hidden_width, self.observation_latent)
         self.decoder_start = DecoderStart(self.hidden_width)
-        self.decoder = TrajectoryDecoder(self.hidden_width)
+        self.decoder = recording_decoder(self.hidden_width, self.image_shape, self.is_still)
         self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
 
     def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
@@ -121,14 +130,14 @@ class HVAE(nn.Module):
           noise: of the two sampled latents.
           training: True normalises with batch statistics and updates the running averages.
         """
-        h = self.encoder(features)
+        h, start = encoded(self.encoder, features, training)
         action_mean, action_log_variance = self.action_inference(h, training)
         c = sample_gaussian(action_mean, action_log_variance, noise.action.T)
         z_mean, z_log_variance = self.observation_inference(h, c, training)
         z_noise = jnp.moveaxis(noise.observation, -1, 0)
         z = sample_gaussian(z_mean, z_log_variance[:, None, None], z_noise)
         prior_mean, prior_log_variance = self.latent_prior(c, training)
-        prediction = self.decoder(self.decoder_start(z, c), features[:, :, 0], features.shape[2])
+        prediction = decoded(self.decoder, self.decoder_start(z, c), start, features, training)
         return VAEOutput(
             action_mean=action_mean.T,
             action_log_variance=action_log_variance.T,
@@ -142,5 +151,6 @@ class HVAE(nn.Module):
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`q(c | O)` with running averages: f32[B, S, T, D] -> (mean, log-variance) f32[B, dc]."""
-        mean, log_variance = self.action_inference(self.encoder(features), False)
+        h, _ = encoded(self.encoder, features, False)
+        mean, log_variance = self.action_inference(h, False)
         return mean.T, log_variance.T

@@ -75,7 +75,8 @@ class RepresentationLearner:
 
         Args:
           key: typed key, consumed.
-          recordings_shape: (A_train, S_total, T, D0) of the recordings to train on.
+          recordings_shape: (A_train, S_total, T, D0) of the recordings to train on; of images
+            (A_train, S_total, T, height, width, channels), of stills without T.
         Raises:
           ValueError: the recordings are too few for the config's batches, or have no step to
             predict.
@@ -83,7 +84,8 @@ class RepresentationLearner:
         self._check_trainable(recordings_shape)
         key_params, key_run = jax.random.split(key)
         key_epochs, key_steps = jax.random.split(key_run)
-        features = jnp.zeros((1, 1, recordings_shape[2], self.modality.feature_dim))
+        num_steps = self.modality.num_steps(recordings_shape)
+        features = jnp.zeros((1, 1, num_steps, self.modality.feature_dim))
         variables = jax.jit(self._init_variables)(key_params, features)
         return RepresentationState(
             params=variables["params"],
@@ -145,9 +147,10 @@ class RepresentationLearner:
           ValueError: `recordings` is not 4-dimensional or is empty, they do not suit the modality,
             or `batch` < 1.
         """
-        if len(recordings.shape) != 4 or 0 in recordings.shape:
+        if len(recordings.shape) != 2 + self.modality.recording_rank or 0 in recordings.shape:
             raise ValueError(
-                f"recordings must be a non-empty [A, S, T, D0], got shape {recordings.shape}."
+                f"recordings must be a non-empty {self._recordings_form}, got shape "
+                f"{recordings.shape}."
             )
         if batch < 1:
             raise ValueError(f"batch={batch} must be at least 1.")
@@ -160,13 +163,14 @@ class RepresentationLearner:
         return np.concatenate(means)[:num_actions], np.concatenate(log_variances)[:num_actions]
 
     def _check_trainable(self, shape: tuple[int, ...]) -> None:
-        if len(shape) != 4 or shape[2] < 2:
+        is_still = self.modality.is_still
+        if len(shape) != 2 + self.modality.recording_rank or (not is_still and shape[2] < 2):
+            steps = "" if is_still else " with T >= 2 (step 0 is given, the others are predicted)"
             raise ValueError(
-                f"recordings must be [A_train, S_total, T, D0] with T >= 2 (step 0 is given, the "
-                f"others are predicted), got shape {tuple(shape)}."
+                f"recordings must be {self._recordings_form}{steps}, got shape {tuple(shape)}."
             )
         config, (num_actions, num_recordings) = self.config, shape[:2]
-        if config.kind == "vae":
+        if self._pools_recordings:
             if self._flat_batch_size(num_actions) < 1:
                 raise ValueError(
                     f"actions_per_batch * recordings_per_action = "
@@ -186,6 +190,17 @@ class RepresentationLearner:
                 f"{num_recordings} recordings per action; set it to at most {num_recordings} or "
                 "collect more recordings."
             )
+
+    @property
+    def _recordings_form(self) -> str:
+        last = {2: "T, D0", 3: "height, width, channels", 4: "T, height, width, channels"}
+        return f"[A, S, {last[self.modality.recording_rank]}]"
+
+    @property
+    def _pools_recordings(self) -> bool:
+        """Whether batches are drawn from all recordings alike: the flat VAE, but not of images,
+        whose batches are those of the HVAE (spec method 4)."""
+        return self.config.kind == "vae" and self.modality.image_shape is None
 
     def _flat_batch_size(self, num_actions: int) -> int:
         """Recordings in a flat-VAE batch: `A * floor(B * S / A)` (spec method 4)."""
@@ -253,7 +268,7 @@ class RepresentationLearner:
         key_step = jax.random.fold_in(state.key_steps, state.step)
         key_batch, key_noise = jax.random.split(key_step)
         config = self.config
-        if config.kind == "hvae":
+        if not self._pools_recordings:
             epoch = state.step // (recordings.shape[0] // config.actions_per_batch)
             batch = hvae_batch(
                 state.key_epochs,
@@ -271,13 +286,15 @@ class RepresentationLearner:
         return self._features(batch), epoch, key_noise
 
     def _features(self, recordings: jax.Array) -> jax.Array:
-        """f32[..., T, D] of stored recordings [..., T, D0].
+        """f32[..., T, D] of stored recordings [..., T, D0] or of images.
 
         Raises:
           ValueError: the modality's `featurize` gives something else.
         """
         features = self.modality.featurize(recordings)
-        expected = (*recordings.shape[:-1], self.modality.feature_dim)
+        leading = recordings.shape[: recordings.ndim - self.modality.recording_rank]
+        num_steps = self.modality.num_steps((0, 0, *recordings.shape[len(leading) :]))
+        expected = (*leading, num_steps, self.modality.feature_dim)
         if features.shape != expected or features.dtype != jnp.float32:
             raise ValueError(
                 f"Modality {self.modality.name!r} made {features.dtype}{features.shape} of "
@@ -324,12 +341,16 @@ def _build_model(config: RepresentationConfig, modality: Modality) -> HVAE | Fla
             action_latent=config.action_latent,
             observation_latent=config.observation_latent,
             gaussian_dim=modality.gaussian_dim,
+            image_shape=modality.image_shape,
+            is_still=modality.is_still,
         )
     return FlatVAE(
         encoder_width=config.encoder_width,
         hidden_width=config.hidden_width,
         observation_latent=config.observation_latent,
         gaussian_dim=modality.gaussian_dim,
+        image_shape=modality.image_shape,
+        is_still=modality.is_still,
     )
 
 

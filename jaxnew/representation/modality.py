@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
+
+from jaxnew.representation.images import check_image_shape
 
 GAUSSIAN = "gaussian"
 CATEGORICAL = "categorical"
@@ -22,7 +25,11 @@ class Modality:
       likelihood: "gaussian" or "categorical".
       num_categories: categories per coordinate for a categorical likelihood, whose D numbers are
         one-hot blocks of that size, one after the other; 0 for a Gaussian one.
-      featurize: stored recordings [..., T, D0], uint8 or float -> f32[..., T, D]; pure JAX.
+      featurize: stored recordings [..., T, D0], uint8 or float -> f32[..., T, D]; pure JAX. Images
+        are stored [..., T, height, width, channels], stills without T, which is 1.
+      image_shape: (side, side, channels) where a step is an image, whose D numbers are then in that
+        order; else None.
+      is_still: whether a recording is one image.
 
     Raises:
       ValueError: the fields contradict each other.
@@ -33,6 +40,8 @@ class Modality:
     likelihood: str
     num_categories: int
     featurize: Callable[[jax.Array], jax.Array]
+    image_shape: tuple[int, int, int] | None = None
+    is_still: bool = False
 
     def __post_init__(self) -> None:
         if self.likelihood not in (GAUSSIAN, CATEGORICAL):
@@ -56,6 +65,30 @@ class Modality:
                 f"num_categories={self.num_categories}."
             )
 
+        self._check_images()
+
+    def _check_images(self) -> None:
+        if self.image_shape is None:
+            if self.is_still:
+                raise ValueError(f"Modality {self.name!r}: is_still needs an image_shape.")
+            return
+        check_image_shape(self.image_shape)
+        if self.feature_dim != math.prod(self.image_shape) or self.likelihood != GAUSSIAN:
+            raise ValueError(
+                f"Modality {self.name!r}: images of {self.image_shape} have feature_dim="
+                f"{math.prod(self.image_shape)} and a {GAUSSIAN!r} likelihood; got feature_dim="
+                f"{self.feature_dim} and {self.likelihood!r}."
+            )
+
+    @property
+    def recording_rank(self) -> int:
+        """Axes of one stored recording."""
+        return 2 if self.image_shape is None else 4 - self.is_still
+
+    def num_steps(self, recordings_shape: tuple[int, ...]) -> int:
+        """T of recordings [A, S, ...]."""
+        return 1 if self.is_still else recordings_shape[2]
+
     @property
     def gaussian_dim(self) -> int:
         """D if the likelihood is Gaussian, else 0."""
@@ -75,6 +108,27 @@ def one_hot_modality(name: str, num_coordinates: int, num_categories: int) -> Mo
         return blocks.reshape(*recordings.shape[:-1], num_coordinates * num_categories)
 
     return Modality(name, num_coordinates * num_categories, CATEGORICAL, num_categories, featurize)
+
+
+def image_modality(
+    name: str, image_shape: tuple[int, int, int], is_still: bool = False
+) -> Modality:
+    """Stored uint8 images, scaled to +-0.5, with a Gaussian likelihood of pixels (spec method 3).
+
+    Args:
+      name: see `Modality`.
+      image_shape: (side, side, channels) with a side of 48 or 84.
+      is_still: recordings are single images [..., side, side, channels] instead of videos
+        [..., T, side, side, channels].
+    """
+    size = math.prod(image_shape)
+
+    def featurize(recordings: jax.Array) -> jax.Array:
+        leading = recordings.shape[:-3]
+        steps = (*leading, 1) if is_still else leading
+        return (recordings.astype(jnp.float32) / 255.0 - 0.5).reshape(*steps, size)
+
+    return Modality(name, size, GAUSSIAN, 0, featurize, image_shape, is_still)
 
 
 def _as_float(recordings: jax.Array) -> jax.Array:

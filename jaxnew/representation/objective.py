@@ -37,7 +37,8 @@ class VAEOutput:
       observation_mean: f32[B, S, dz] and observation_log_variance: f32[dz], posterior of z.
       prior_mean: f32[B, 1, dz] and prior_log_variance: f32[dz], prior of z; zeros (N(0, I)) for
         the flat VAE.
-      prediction: f32[B, S, T-1, D] means or logits of the steps 1..T-1.
+      prediction: f32[B, S, T-1, D] means or logits of the steps 1..T-1; f32[B, S, 1, D] of a still
+        image.
       likelihood_log_variance: f32[D], None for a categorical likelihood.
     """
 
@@ -152,10 +153,11 @@ def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> E
 
     Args:
       output: of the model's forward pass on `features`.
-      features: f32[B, S, T, D]; step 0 is given to the decoder and not scored.
+      features: f32[B, S, T, D]; step 0 is given to the decoder and not scored, unless T = 1, which
+        is a still image.
       num_categories: categories per coordinate; not read for a Gaussian likelihood.
     """
-    target = features[:, :, 1:]
+    target = features[:, :, 1:] if features.shape[2] > 1 else features
     log_variance = output.likelihood_log_variance
     if log_variance is None:
         log_likelihood = categorical_log_likelihood(target, output.prediction, num_categories)

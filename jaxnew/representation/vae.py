@@ -6,12 +6,17 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew.representation.decoders import DecoderStart, TrajectoryDecoder
+from jaxnew.representation.decoders import DecoderStart
 from jaxnew.representation.encoders import (
     Dense,
     LatentHead,
-    TrajectoryEncoder,
     likelihood_log_variance,
+)
+from jaxnew.representation.images import (
+    decoded,
+    encoded,
+    recording_decoder,
+    recording_encoder,
 )
 from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
 
@@ -35,27 +40,32 @@ class FlatInference(nn.Module):
 
 
 class FlatVAE(nn.Module):
-    """The flat VAE for trajectories: encoder, `q(z | o)`, decoder, prior N(0, I).
+    """The flat VAE: encoder, `q(z | o)`, decoder, prior N(0, I).
 
-    Dense layers keep PyTorch's default initialisation (spec method 4).
+    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation
+    (spec method 4).
 
     Attributes:
       encoder_width: E.
       hidden_width: H.
       observation_latent: dz.
-      gaussian_dim: see `HVAE`.
+      gaussian_dim, image_shape, is_still: see `HVAE`.
     """
 
     encoder_width: int
     hidden_width: int
     observation_latent: int
     gaussian_dim: int
+    image_shape: tuple[int, int, int] | None = None
+    is_still: bool = False
 
     def setup(self) -> None:
-        self.encoder = TrajectoryEncoder(self.encoder_width)
+        self.encoder = recording_encoder(self.encoder_width, self.image_shape)
         self.inference = FlatInference(self.hidden_width, self.observation_latent)
         self.decoder_start = DecoderStart(self.hidden_width, pytorch_init=True)
-        self.decoder = TrajectoryDecoder(self.hidden_width, pytorch_init=True)
+        self.decoder = recording_decoder(
+            self.hidden_width, self.image_shape, self.is_still, pytorch_init=True
+        )
         self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
 
     def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
@@ -66,10 +76,12 @@ class FlatVAE(nn.Module):
           noise: of the sampled latents.
           training: True normalises with batch statistics and updates the running averages.
         """
-        mean, log_variance = self.inference(self.encoder(features), training)
+        h, start = encoded(self.encoder, features, training)
+        mean, log_variance = self.inference(h, training)
         z_noise = jnp.moveaxis(noise.observation, -1, 0)
         z = sample_gaussian(mean, log_variance[:, None, None], z_noise)
-        prediction = self.decoder(self.decoder_start(z, None), features[:, :, 0], features.shape[2])
+        g = self.decoder_start(z, None)
+        prediction = decoded(self.decoder, g, start, features, training)
         return VAEOutput(
             action_mean=None,
             action_log_variance=None,
@@ -90,6 +102,6 @@ class FlatVAE(nn.Module):
           f32[B, dz] mean over S of the recordings' posterior means, and their shared
           log-variance, f32[B, dz].
         """
-        mean, log_variance = self.inference(self.encoder(features), False)
+        mean, log_variance = self.inference(encoded(self.encoder, features, False)[0], False)
         mean = jnp.mean(mean, axis=-1).T
         return mean, jnp.broadcast_to(log_variance, mean.shape)

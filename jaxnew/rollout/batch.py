@@ -7,6 +7,7 @@ from typing import Any
 import jax
 from flax import struct
 
+from jaxnew.rollout.frames import FrameHistory
 from jaxnew.sampling import AvailableSet
 
 
@@ -15,7 +16,8 @@ class RolloutBatch:
     """`T` steps of `N` parallel environments; every field is `[T, N, ...]`.
 
     Attributes:
-      observation: f32[T, N, ...] as the policy saw it (normalised).
+      observation: f32[T, N, ...] as the policy saw it (normalised), or its frames where it saw
+        stacks of them.
       available: sets [T, N, m] in force at each step; None where one set stays in force for ever
         (`RolloutConfig.has_fixed_set`), which is not stored for every step.
       sample: what the policy's distribution drew, a pytree.
@@ -27,7 +29,7 @@ class RolloutBatch:
       done: bool[T, N] any end.
     """
 
-    observation: jax.Array
+    observation: jax.Array | FrameHistory
     available: AvailableSet | None
     sample: Any
     log_prob: jax.Array
@@ -36,3 +38,9 @@ class RolloutBatch:
     reward: jax.Array
     terminated: jax.Array
     done: jax.Array
+
+    def observations(self, indices: jax.Array) -> jax.Array:
+        """Observations [B, ...] of the transitions int32[B], which count `t * N + n`."""
+        if isinstance(self.observation, FrameHistory):
+            return self.observation.take(indices)
+        return self.observation.reshape(-1, *self.observation.shape[2:])[indices]

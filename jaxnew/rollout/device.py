@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Environment, Info
-from jaxnew.policy import PolicyMethod
+from jaxnew.policy import PolicyMethod, distribution_and_value
 from jaxnew.rollout.batch import RolloutBatch
 from jaxnew.rollout.normalization import RunningStatistics
 from jaxnew.sampling import ActionPool, AvailableSet, draw_sets, whole_pool
@@ -200,11 +200,10 @@ class DeviceRollout:
     ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
         """One step; the sets of the next state are still those of this one."""
         key_sample, keys_env = keys
-        distribution = self.method.distribution(
-            params, state.observation, projected, state.available.mask
+        distribution, value = distribution_and_value(
+            self.method, params, state.observation, projected, state.available.mask
         )
         sample = distribution.sample(key_sample)
-        value = self.method.value(params, state.observation)
         raw_obs, env_state, reward, terminated, truncated, info = jax.vmap(
             self.env.step, in_axes=(0, 0, 0, None)
         )(

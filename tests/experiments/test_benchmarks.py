@@ -15,7 +15,7 @@ import pytest
 from absl import flags
 from absl.testing import flagsaver
 
-from experiments.benchmarks import _floor, environment, run, sweep, training
+from experiments.benchmarks import _floor, create, environment, pool, run, sweep, training
 from experiments.benchmarks import _measure as m
 from jaxnew.ppo import Learner
 from jaxnew.rollout.device import DeviceRollout
@@ -118,6 +118,40 @@ def test_compilation_is_added_to_every_round() -> None:
 
 
 @pytest.mark.unit
+def test_overheads_of_made_up_timings(tmp_path: Path) -> None:
+    output = tmp_path / "results.jsonl"
+    # Ten decisions in 1, 10, 3 and 2 ms: 100 us for the loop's; beyond it 900, 200 and 100 us.
+    wall_s = {"plain loop": 1e-3, "pool, 1 worker": 3e-3, "pool, 2 workers": 2e-3, pool.PEER: 1e-2}
+    cpu_us = {"plain loop": 1.0, "pool, 1 worker": 3.0, "pool, 2 workers": 5.0, pool.PEER: 21.0}
+    timings = {case: m.Timing((x, x, 9.0), (0.0, 0.0, 0.0)) for case, x in wall_s.items()}
+    flags.FLAGS.mark_as_parsed()
+    with flagsaver.flagsaver(output=str(output)):
+        report = m.Report("pool")
+        pool.report_overheads(report, pool.EMPTY, timings, cpu_us, num_envs=4, num_decisions=10)
+        pool.report_overheads(report, pool.WORKING, timings, cpu_us, num_envs=4, num_decisions=10)
+    lines = read(output)
+    values = {line["case"]: line["values"] for line in lines}
+    peer = values[f"empty, overhead of {pool.PEER}"]
+    assert peer == {"wall_us": pytest.approx(900.0), "cpu_us": pytest.approx(20.0)}
+    ratios = {n: values[f"empty, overhead of {pool.PEER} / {pool.pool_name(n)}"] for n in (1, 2)}
+    assert ratios[1] == {"wall": pytest.approx(4.5), "cpu": pytest.approx(10.0)}
+    assert ratios[2] == {"wall": pytest.approx(9.0), "cpu": pytest.approx(5.0)}
+    assert len(lines) == 5 + 3  # Ratios only where there is no work.
+
+
+@pytest.mark.unit
+def test_processor_time_of_other_processes() -> None:
+    command = [sys.executable, "-c", "sum(range(10**7)); print(flush=True); input()"]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
+        way = pool.Way(print, (process.pid,))
+        assert process.stdout is not None
+        process.stdout.readline()
+        assert 0.05 < way.children_cpu_s() < 30.0  # About 0.2 s, on any machine and start included.
+        process.communicate(b"\n")
+    assert pool.Way(print).children_cpu_s() == 0.0
+
+
+@pytest.mark.unit
 def test_subjects_alternate_and_the_first_round_is_not_counted() -> None:
     calls: list[tuple[str, float]] = []
 
@@ -195,6 +229,29 @@ def test_environment_runs_without_peers(tmp_path: Path) -> None:
             decisions, moves = (line["rates"][unit]["median"] for unit in ("decisions", "moves"))
             assert line["num_envs"] == 4
             assert moves == pytest.approx(5 * decisions)
+
+
+@pytest.mark.integration
+def test_create_tells_what_drawing_and_physics_take(tmp_path: Path) -> None:
+    lines = {line["case"]: line for line in run_quick("create", tmp_path)}
+    for name in ("gray", "rgb", "none"):
+        rates = lines[f"Push, observation {name}"]["rates"]
+        assert rates["substeps"]["median"] == pytest.approx(40 * rates["decisions"]["median"])
+        assert ("rendering" in lines[f"Push, observation {name}"]["includes"]) == (name != "none")
+    assert 0.0 < lines["Push, share of the physics"]["values"]["cpu"] < 1.0
+    for tools in (0, 10):
+        assert lines[f"one gray frame, Push with {tools} tools"]["rates"]["frames"]["median"] > 0
+
+
+@pytest.mark.unit
+def test_the_clock_of_the_physics_is_taken_off_again() -> None:
+    run_before, clock = create.Stage.run, create.Clock()
+    env = create.crowded_env("Push", 3)
+    assert len(env.world.tools) == 3
+    with create.timed_physics(clock):
+        env.world.run(2000)
+    assert 0.0 < clock.physics <= clock.whole
+    assert create.Stage.run is run_before
 
 
 @pytest.mark.slow

@@ -346,3 +346,18 @@ def test_a_half_deleted_checkpoint_no_longer_counts(
     assert checkpointer.steps("latest") == [2, 3]
     checkpointer.save("latest", 4, {"a": jnp.float32(4)})
     assert sorted(os.listdir(tmp_path / "latest")) == ["000000000003", "000000000004"]
+
+
+@pytest.mark.unit
+def test_a_part_of_a_state_can_be_read(tmp_path: Path) -> None:
+    """Leaves that the example lacks are left out; those that it has must still fit."""
+    state = make_state(3)
+    Checkpointer(tmp_path).save("best", 3, state)
+    part = state.replace(opt_state=None, extras=None)
+    with pytest.raises(CheckpointError, match="of the checkpoint is not expected"):
+        Checkpointer(tmp_path).restore("best", part)
+    found, _ = Checkpointer(tmp_path).restore("best", part, is_part=True)
+    assert_same(found, part)
+    wrong = part.replace(params={"w": jnp.zeros(5), "b": jnp.zeros(3)})
+    with pytest.raises(CheckpointError, match=r"\.params\['w'\]"):
+        Checkpointer(tmp_path).restore("best", wrong, is_part=True)

@@ -1,0 +1,192 @@
+"""The rules of one episode: what an action earns and when it is over (spec create 1.6-1.8, 6)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import StrEnum
+
+from envs_host.create.config import CreateConfig
+from envs_host.create.geometry import Point, clip, is_in_bounds, scaled_distance
+from envs_host.create.layout import Layout
+from envs_host.create.tools import Tool
+from envs_host.create.world import Placement, World
+
+_QUIET_ACTIONS_ALLOWED = 1
+
+
+class End(StrEnum):
+    """Why an episode is over."""
+
+    STEP_LIMIT = "step_limit"
+    TARGET_OUT = "target_out"
+    STILL = "still"
+    MARKER_OUT = "marker_out"
+    GOAL = "goal"
+
+
+@dataclass
+class Summary:
+    """Totals of an episode so far.
+
+    Attributes:
+      length: actions.
+      goal_hit, target_hit: 0 or 1.
+      reward: undiscounted return; `subgoal_reward` and `dense_reward` are parts of it.
+      num_placed, num_no_op, num_blocked, num_invalid: outcomes of the actions.
+    """
+
+    length: int = 0
+    goal_hit: int = 0
+    target_hit: int = 0
+    reward: float = 0.0
+    subgoal_reward: float = 0.0
+    dense_reward: float = 0.0
+    num_placed: int = 0
+    num_no_op: int = 0
+    num_blocked: int = 0
+    num_invalid: int = 0
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What one action brought: its reward, and why the episode ends now (nothing: it goes on)."""
+
+    reward: float
+    placement: Placement
+    ends: tuple[End, ...] = field(default=())
+
+    @property
+    def terminated(self) -> bool:
+        return any(end != End.STEP_LIMIT for end in self.ends)
+
+    @property
+    def truncated(self) -> bool:
+        return End.STEP_LIMIT in self.ends
+
+
+class Episode:
+    """An episode under way. An action is `simulate`, then (after drawing) `judge`.
+
+    The picture of an action still shows the subgoals that `judge` then removes (1.6).
+    """
+
+    def __init__(self, layout: Layout, config: CreateConfig) -> None:
+        self.config = config
+        self.level = layout.level
+        self.step_limit = config.step_limit or self.level.step_limit
+        walls = self.level.frame_walls if config.frame_walls == "level" else None
+        has_walls = config.frame_walls == "on" if walls is None else walls
+        self.world = World(layout, config.physics, has_walls, config.min_tool_distance)
+        self.summary = Summary()
+        self._start = self.world.positions
+        self._num_quiet = 0
+        self._placement = Placement.NO_OP
+        self._rewards = {
+            name: self.level.reward_overrides.get(name, getattr(config.rewards, name))
+            for name in ("goal", "subgoal", "target_hit")
+        }
+        if not config.rewards.with_subgoals:
+            self._rewards.update(subgoal=0.0, target_hit=0.0)
+
+    def step(self, tool: Tool, position: Point) -> Outcome:
+        """One whole action; `position` is normalised and clipped to [-1, 1]."""
+        self.simulate(tool, position)
+        return self.judge()
+
+    def simulate(
+        self,
+        tool: Tool,
+        position: Point,
+        watch: Callable[[World], None] | None = None,
+        watch_every: int = 4,
+    ) -> None:
+        """Tries to place the tool and runs the world (1.6, steps 2 and 3)."""
+        self._placement = self.world.place(tool, clip(position))
+        self.world.run(self.config.physics.substeps, watch, watch_every)
+
+    def judge(self) -> Outcome:
+        """Rewards and ends of the action just simulated (1.6, steps 1 and 5 to 8)."""
+        summary = self.summary
+        reward = self.config.rewards.alive + self._placement_reward()
+        summary.length += 1
+        ends = self._common_ends()
+        is_armed = summary.target_hit == 1 or not self.level.has_marker
+        dense = self._dense_reward(is_armed)
+        if is_armed and summary.goal_hit == 0 and self.world.has_touched_goal:
+            summary.goal_hit = 1
+            reward += self._rewards["goal"] - self._discount()
+            if self.config.end_on_goal:
+                ends.append(End.GOAL)
+        subgoals = self.world.take_reached_subgoals() * max(
+            0.0, self._rewards["subgoal"] - self._discount()
+        )
+        if self.level.has_marker:
+            reward += self._judge_marker(ends)
+        reward += subgoals + dense
+        summary.reward += reward
+        summary.subgoal_reward += subgoals
+        summary.dense_reward += dense
+        return Outcome(reward, self._placement, tuple(ends))
+
+    def _placement_reward(self) -> float:
+        """Counts the outcome of the placement and gives its reward."""
+        name = self._placement.value
+        setattr(self.summary, f"num_{name}", getattr(self.summary, f"num_{name}") + 1)
+        return 0.0 if name == "placed" else getattr(self.config.rewards, name)
+
+    def _discount(self) -> float:
+        """How much less a goal or subgoal is worth by now: 0.1 per placed tool (6.1)."""
+        return self.config.rewards.per_tool_discount * self.summary.num_placed
+
+    def _common_ends(self) -> list[End]:
+        """The ends that every kind of level has (1.7)."""
+        ends = []
+        if self.summary.length > self.step_limit:
+            ends.append(End.STEP_LIMIT)
+        if not is_in_bounds(self.world.positions.target):
+            ends.append(End.TARGET_OUT)
+        # Never reset: the second quiet action ends, consecutive or not (A24).
+        self._num_quiet += self.world.is_still(self.config.stop_speed)
+        if self._num_quiet > _QUIET_ACTIONS_ALLOWED:
+            ends.append(End.STILL)
+        return ends
+
+    def _judge_marker(self, ends: list[End]) -> float:
+        """The target's first hit, then the marker's bounds (1.6, step 8)."""
+        reward = 0.0
+        if self.summary.target_hit == 0 and self._is_target_hit():
+            self.summary.target_hit = 1
+            reward += self._rewards["target_hit"]
+        marker = self.world.positions.marker
+        assert marker is not None
+        if self.summary.target_hit == 0 and not is_in_bounds(marker):
+            ends.append(End.MARKER_OUT)
+            reward += self.config.rewards.marker_lost
+        return reward
+
+    def _is_target_hit(self) -> bool:
+        """Whether the target has moved, and by the marker if it must (6.4)."""
+        start, now = self._start.target, self.world.positions.target
+        has_moved = scaled_distance(start, now) > self.config.move_threshold
+        if self.level.marker_must_hit_target:
+            has_moved = has_moved and self.world.has_marker_hit_target
+        if self.config.directional_target_hit:
+            towards_goal = self._start.goal[0] - start[0]
+            has_moved = has_moved and (now[0] - start[0]) * towards_goal > 0.0
+        return has_moved
+
+    def _dense_reward(self, is_armed: bool) -> float:
+        """The variant of spec create 6.6, before this action's goal is credited."""
+        scale = self.config.rewards.dense_scale
+        if scale == 0.0 or self.summary.goal_hit == 1:
+            return 0.0
+        start, now = self._start, self.world.positions
+        gain = 0.0
+        if is_armed:
+            gain += scaled_distance(start.target, start.goal)
+            gain -= scaled_distance(now.target, now.goal)
+        if start.marker is not None and now.marker is not None:
+            gain += scaled_distance(start.target, start.marker)
+            gain -= scaled_distance(now.target, now.marker)
+        return scale * gain

@@ -1,0 +1,88 @@
+"""CREATE in the form that `envs_host.pool` runs: ids and positions in, gray frames out."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.environment import CreateEnv
+from envs_host.protocol import Step
+
+EPISODE_METRICS = (
+    "is_success",
+    "target_hit",
+    "episode_return",
+    "episode_length",
+    "subgoal_reward",
+    "num_placed",
+    "num_blocked",
+    "num_no_op",
+)
+
+
+class CreateHost:
+    """One level, whose actions are ids of tools; the rollout owns the available sets.
+
+    Everything in an episode (the noise of the level) follows from the seed of its reset.
+
+    In a pool: `HostPool("envs_host.create.hosting:CreateHost", {"level": "Push"}, ...)`.
+
+    Args:
+      level: name of a level or a level file.
+      deterministic: True leaves out the noise of the level's positions.
+      with_subgoals: False sets the rewards of subgoals and of the target's hit to 0.
+      split: name of a split; "analysis" takes ids of the 3-degree list of tools.
+      settings: further fields of `CreateConfig` that are plain values.
+    """
+
+    position_dim = 2
+    episode_metrics = EPISODE_METRICS
+
+    def __init__(
+        self,
+        level: str = "Push",
+        deterministic: bool = False,
+        with_subgoals: bool = True,
+        split: str = "default",
+        settings: Mapping[str, Any] | None = None,
+    ) -> None:
+        config = CreateConfig(
+            rewards=RewardConfig(with_subgoals=with_subgoals),
+            split=split,
+            action_ids="universe",
+            observation="gray",
+        )
+        self.env = CreateEnv(level, deterministic, replace(config, **(settings or {})))
+        self.observation_shape = self.env.observation_space.shape or ()
+        self.observation_dtype = np.uint8
+
+    def reset(self, seed: np.random.SeedSequence) -> np.ndarray:
+        """Starts an episode; returns its first frame uint8[84, 84]."""
+        # 64 bits, so that no two of a run's episodes share a layout by chance.
+        observation, _ = self.env.reset(seed=int(seed.generate_state(1, np.uint64)[0]))
+        return observation
+
+    def step(self, action_id: int, position: np.ndarray) -> Step:
+        """Tries to place tool `action_id` at `position` f32[2] in [-1, 1]^2; 40 substeps pass."""
+        observation, reward, terminated, truncated, _ = self.env.step(
+            {"index": action_id, "position": position}
+        )
+        summary = self.env.episode.summary
+        metrics = {
+            "is_success": float(summary.goal_hit),
+            "target_hit": float(summary.target_hit),
+            "episode_return": summary.reward,
+            "episode_length": float(summary.length),
+            "subgoal_reward": summary.subgoal_reward,
+            "num_placed": float(summary.num_placed),
+            "num_blocked": float(summary.num_blocked),
+            "num_no_op": float(summary.num_no_op),
+        }
+        return Step(observation, reward, terminated, truncated, metrics)
+
+    def close(self) -> None:
+        self.env.close()

@@ -1,0 +1,33 @@
+"""The levels of CREATE: twelve tasks, a smoke level, and those of the user (spec create 5)."""
+
+from envs_host.create.levels.registry import (
+    TASK_NAMES,
+    level_names,
+    load_level,
+    parse_level,
+    register_folder,
+    register_level,
+)
+from envs_host.create.levels.schema import (
+    BallSpec,
+    GoalSpec,
+    Level,
+    LevelError,
+    NoiseGroup,
+    ObjectSpec,
+)
+
+__all__ = [
+    "TASK_NAMES",
+    "BallSpec",
+    "GoalSpec",
+    "Level",
+    "LevelError",
+    "NoiseGroup",
+    "ObjectSpec",
+    "level_names",
+    "load_level",
+    "parse_level",
+    "register_folder",
+    "register_level",
+]

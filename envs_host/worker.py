@@ -1,0 +1,262 @@
+"""A worker process of `envs_host.pool.HostPool`, which starts it as `python -m envs_host.worker`.
+
+It holds some environments of every half, answers one byte with one byte per decision, and exits
+when the other end of its socket is closed.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import faulthandler
+import io
+import os
+import select
+import signal
+import socket
+import sys
+import threading
+import time
+import traceback
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+
+from envs_host import _channel as codes
+from envs_host._channel import Channel, HungUp
+from envs_host._memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
+from envs_host.protocol import HostEnvironment, load_factory
+
+# A worker in the middle of a step gets this long to finish once the pool's process is gone.
+GRACE_S = 1.0
+
+
+class ProtocolError(Exception):
+    """An environment breaks the protocol."""
+
+
+class Host:
+    """The environments of one worker.
+
+    Attributes:
+      format: of all environments.
+      environment: the one at work, None between them.
+      activity: what the worker is doing; it goes into error messages.
+    """
+
+    def __init__(self, setup: Setup) -> None:
+        self.environment: int | None = None
+        self.activity = "started"
+        self.format: Format
+        self._setup = setup
+        self._seed, self._is_numbered = 0, False
+        self._arrays: SharedArrays
+        self._environments: dict[int, HostEnvironment] = {}
+
+    def make_environments(self) -> None:
+        if self._setup.core is not None and hasattr(os, "sched_setaffinity"):  # Not on macOS.
+            os.sched_setaffinity(0, {self._setup.core})
+        make = load_factory(self._setup.factory)
+        for first, end in self._setup.halves:
+            for i in range(first, end):
+                self.environment = i
+                self._environments[i] = make(**self._setup.kwargs)
+        self.environment = None
+        self.format = self._common_format()
+        self._shape = self.format.observation_shape
+        self._dtype = np.dtype(self.format.observation_dtype)
+        self._metric_names = frozenset(self.format.episode_metrics)
+
+    def _common_format(self) -> Format:
+        formats = {i: _format_of(env) for i, env in self._environments.items()}
+        first = next(iter(formats.values()))
+        for i, other in formats.items():
+            if other != first:
+                raise ProtocolError(
+                    f"The factory makes different environments: {first} and, for environment {i}, "
+                    f"{other}. All must have the same shapes, dtypes and metrics."
+                )
+        return first
+
+    def share(self, descriptor: int) -> None:
+        """Maps the memory that the pool made, and closes the descriptor."""
+        self._arrays = SharedArrays.over(descriptor, self.format, self._setup.num_envs)
+        os.close(descriptor)
+
+    def restore(self, restore: Restore, tell_progress: Callable[[], None]) -> None:
+        """Starts the environments' running episodes and replays what happened in them."""
+        self.activity = "restored environments"
+        self._seed, self._is_numbered = restore.seed, restore.is_numbered
+        for i, (ids, positions) in restore.logs.items():
+            self.environment = i
+            observation = self._reset(i, int(self._arrays.episodes[i]))
+            for t, (action_id, position) in enumerate(zip(ids.tolist(), positions, strict=True)):
+                observation, _, terminated, truncated, _ = self._environments[i].step(
+                    action_id, position.copy()
+                )
+                if terminated or truncated:
+                    raise ProtocolError(
+                        f"Replaying {len(ids)} actions, the episode ended after {t + 1}, which it "
+                        "had not done before: the environment does not follow from its seed and "
+                        "actions alone, or it has changed."
+                    )
+                tell_progress()
+            self._arrays.observations[i] = self._checked(observation)
+            tell_progress()
+        self.environment = None
+
+    def step(self, half: int) -> None:
+        """Does one decision in the environments of a half; those that end start anew."""
+        self.activity = f"stepped half {half}"
+        arrays, names = self._arrays, self.format.episode_metrics
+        first, end = self._setup.halves[half]
+        rewards, terminations, truncations, rows = [], [], [], []
+        actions = zip(
+            arrays.ids[first:end].tolist(), arrays.positions[first:end].copy(), strict=True
+        )
+        for i, (action_id, position) in enumerate(actions, first):
+            self.environment = i
+            observation, reward, terminated, truncated, metrics = self._environments[i].step(
+                action_id, position
+            )
+            observation = self._checked(observation)
+            arrays.final_observations[i] = observation
+            if metrics.keys() != self._metric_names:
+                raise ProtocolError(
+                    f"The metrics of a step are {sorted(metrics)}; episode_metrics says {names}."
+                )
+            rewards.append(float(reward))
+            terminations.append(bool(terminated))
+            truncations.append(bool(truncated))
+            rows.append([float(metrics[name]) for name in names])
+            if terminated or truncated:
+                observation = self._checked(self._reset(i, int(arrays.episodes[i]) + 1))
+            arrays.observations[i] = observation
+        self.environment = None
+        arrays.rewards[first:end] = rewards
+        arrays.terminated[first:end] = terminations
+        arrays.truncated[first:end] = truncations
+        arrays.metrics[first:end] = rows
+
+    def _reset(self, i: int, episode: int) -> Any:
+        key = episode_key(i, episode, self._setup.num_envs, self._is_numbered)
+        return self._environments[i].reset(np.random.SeedSequence(self._seed, spawn_key=key))
+
+    def _checked(self, observation: Any) -> np.ndarray:
+        """The observation; assigning one of another shape would broadcast, of another dtype cast.
+
+        Raises:
+          ProtocolError: it is not what the environment declares.
+        """
+        array = np.asarray(observation)
+        if array.shape != self._shape or array.dtype != self._dtype:
+            raise ProtocolError(
+                f"An observation is {array.dtype}{list(array.shape)}; the environment declares "
+                f"{self._dtype}{list(self._shape)}."
+            )
+        return array
+
+    def close(self) -> None:
+        for env in self._environments.values():
+            close = getattr(env, "close", None)
+            if close is not None:
+                close()
+
+
+def _format_of(env: HostEnvironment) -> Format:
+    dtype = np.dtype(env.observation_dtype)
+    if dtype not in (np.dtype(np.uint8), np.dtype(np.float32)):
+        raise ProtocolError(f"observation_dtype={dtype} must be uint8 or float32.")
+    return Format(
+        tuple(int(size) for size in env.observation_shape),
+        dtype.name,
+        int(env.position_dim),
+        tuple(env.episode_metrics),
+    )
+
+
+def serve(channel: Channel) -> None:
+    """Answers the pool until it hangs up."""
+    host: Host | None = None
+    try:
+        _, setup = channel.receive()
+        host = Host(setup)
+        with _exceptions_told(channel, host):
+            host.make_environments()
+        channel.send(codes.FORMAT, host.format)
+        host.share(channel.receive_memory())
+        while True:
+            _answer(channel, host)
+    except HungUp:
+        if host is not None:
+            host.close()
+
+
+def _answer(channel: Channel, host: Host) -> None:
+    code, payload = channel.receive()
+    with _exceptions_told(channel, host):
+        if code == codes.RESTORE:
+            host.restore(payload, lambda: channel.signal(codes.PROGRESS))
+        else:
+            host.step(code)
+    channel.signal(codes.RESTORED if code == codes.RESTORE else code)
+
+
+@contextlib.contextmanager
+def _exceptions_told(channel: Channel, host: Host) -> Iterator[None]:
+    """Sends any exception to the pool and ends the worker: its environments are in no known state.
+
+    `SystemExit` is one of them: an environment has no business ending the process.
+    """
+    try:
+        yield
+    except HungUp:
+        raise
+    except BaseException as err:
+        failure = Failure(host.environment, host.activity, traceback.format_exc())
+        channel.send(codes.FAILED, failure)
+        raise SystemExit(1) from err
+
+
+def _exit_without_parent(end: socket.socket, parent: int) -> None:
+    """Ends the process when the pool's process is gone, even in the middle of a long step.
+
+    That shows on the socket; and, where some other process has inherited the pool's end of it,
+    by a new parent.
+    """
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR1})  # The main thread's to answer.
+    poll = select.poll()
+    poll.register(end, 0)  # No event but that the other end is closed.
+    while not poll.poll(2000) and os.getppid() == parent:
+        pass
+    time.sleep(GRACE_S)
+    os._exit(1)
+
+
+def main(socket_descriptor: int, report_descriptor: int) -> None:
+    """Serves on an inherited socket.
+
+    Args:
+      socket_descriptor: of the worker's end.
+      report_descriptor: of the file that gets a traceback when the process crashes, and on SIGUSR1.
+    """
+    parent = os.getppid()
+    # Ctrl-C reaches the whole process group; ending is the pool's decision. The pool blocked the
+    # signal so that it could not arrive before this line.
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    for descriptor in (socket_descriptor, report_descriptor):
+        os.set_inheritable(descriptor, False)
+    faulthandler.enable(report_descriptor)
+    faulthandler.register(signal.SIGUSR1, report_descriptor, all_threads=False)
+    # What environments print is seen, but does not mix with the output of the pool's process.
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(line_buffering=True)
+    end = socket.socket(fileno=socket_descriptor)
+    threading.Thread(target=_exit_without_parent, args=(end, parent), daemon=True).start()
+    serve(Channel(end))
+
+
+if __name__ == "__main__":
+    main(int(sys.argv[1]), int(sys.argv[2]))

@@ -1,0 +1,122 @@
+"""What trains and evaluates a policy: inside jit, or with environments on the host."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from jaxnew.evaluation import Evaluator
+from jaxnew.host_evaluation import HostEvaluator
+from jaxnew.policy import PolicyMethod
+from jaxnew.ppo import Learner, PPOConfig, TrainState
+from jaxnew.ppo.host import HostLearner
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.rollout.host import HostRollout, HostRolloutState
+from jaxnew.rollout.normalization import RunningStatistics
+from jaxnew.sampling import ActionPool
+from jaxnew.task import HostDomain, Task
+
+
+@dataclass(frozen=True)
+class DeviceMachinery:
+    """Rollout and update in one compiled function."""
+
+    learner: Learner
+    evaluator: Evaluator
+    restores_whole_state = True
+
+    def init(self, seed: int, table: jax.Array, pool: ActionPool) -> TrainState:
+        """The state before the first update."""
+        return jax.jit(self.learner.init)(jax.random.key(seed), table, pool)
+
+    @cached_property
+    def updates(self) -> Any:
+        """`Learner.updates`, compiled."""
+        return jax.jit(self.learner.updates, static_argnames="num_updates")
+
+    def restarted(
+        self, state: TrainState, pool: ActionPool, statistics: RunningStatistics
+    ) -> TrainState:
+        """`state` with fresh environments that go on with observation statistics of another run."""
+        key = jax.random.fold_in(state.key, 0)
+        rollout = jax.jit(self.learner.rollout.init)(key, pool, statistics)
+        return replace(state, rollout=rollout)
+
+    def example(self, table: jax.Array, pool: ActionPool) -> TrainState:
+        """The shapes of a state."""
+        shapes: TrainState = jax.eval_shape(self.learner.init, jax.random.key(0), table, pool)
+        return shapes
+
+    def close(self) -> None:
+        """Nothing is held."""
+
+
+@dataclass(frozen=True)
+class HostMachinery:
+    """A pool on the host and a compiled update; one pool for training and for evaluations."""
+
+    learner: HostLearner
+    evaluator: HostEvaluator
+    host: HostDomain
+    # Whoever only evaluates does not need the environments of training.
+    restores_whole_state = False
+
+    def init(self, seed: int, table: jax.Array, pool: ActionPool) -> TrainState:
+        """The state before the first update; starts the pool."""
+        return self.learner.init(jax.random.key(seed), table, pool)
+
+    @property
+    def updates(self) -> Any:
+        """`HostLearner.updates`."""
+        return self.learner.updates
+
+    def restarted(self, state: TrainState, pool: ActionPool, statistics: None) -> TrainState:
+        """`state` itself: there are no statistics, and its environments are fresh."""
+        del pool, statistics
+        return state
+
+    def example(self, table: jax.Array, pool: ActionPool) -> TrainState:
+        """The shapes of what a policy needs to act, without environments."""
+        del pool
+        seen = self.host.policy_observation
+
+        def init(key: jax.Array) -> TrainState:
+            key_run, key_params = jax.random.split(key)
+            none: Any = None
+            rollout = HostRolloutState(none, none, none, none)
+            observation = jnp.zeros(seen.shape, seen.dtype)
+            size = table.shape[-1]
+            return self.learner.init_state(key_run, key_params, observation, size, rollout)
+
+        shapes: TrainState = jax.eval_shape(init, jax.random.key(0))
+        return shapes
+
+    def close(self) -> None:
+        """Ends the pool."""
+        self.learner.rollout.environments.close()
+
+
+def machinery_of(
+    task: Task, method: PolicyMethod, config: PPOConfig, seed: int, num_workers: int
+) -> DeviceMachinery | HostMachinery:
+    """What a task needs.
+
+    Args:
+      seed: of environments on the host.
+      num_workers: processes for them; 0 for one per core.
+    """
+    rollout, sizes = config.rollout, (config.rollout.set_size, config.rollout.padded_set_size)
+    if task.host is None:
+        env = task.make_environment()
+        params = env.default_params
+        evaluator = Evaluator(env, params, method, *sizes, rollout.normalize_observations)
+        return DeviceMachinery(
+            Learner(DeviceRollout(env, params, method, rollout), config), evaluator
+        )
+    environments = task.host.environments(rollout.num_envs, seed, num_workers)
+    learner = HostLearner(HostRollout(environments, method, rollout), config)
+    return HostMachinery(learner, HostEvaluator(environments, method, *sizes), task.host)

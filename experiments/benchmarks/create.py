@@ -1,0 +1,169 @@
+"""CREATE, one environment: random play with and without drawing, and the share of the physics.
+
+    taskset -c 1 python -m experiments.benchmarks.create
+
+A decision is a try to place a tool and 40 substeps of 1/30 s; episodes start again when they end,
+with a new layout and a new set of tools. The share of the physics is the time inside
+`pymunk.Space.step`, with the callbacks of the tools, over all of the time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+from absl import flags
+
+from envs_host.create import CreateConfig, CreateEnv
+from envs_host.create.drawing import draw
+from envs_host.create.stage import Stage
+from envs_host.create.tools import all_tools
+from experiments.benchmarks import _measure as m
+
+LEVELS = flags.DEFINE_list("levels", ["Push", "Obstacle"], "What is played.")
+
+SUBSTEPS = CreateConfig().physics.substeps
+_DRAWN = ("gray", "rgb")
+_NUM_TOOLS = 10
+_MAX_TRIES = 10_000
+
+
+@dataclass
+class Clock:
+    """Seconds of the processor inside the physics, and in all."""
+
+    physics: float = 0.0
+    whole: float = 0.0
+
+
+@contextmanager
+def timed_physics(clock: Clock) -> Iterator[None]:
+    """Within it, `Stage.run`, which only calls `Space.step`, adds what it takes to the clock."""
+    patched: Any = Stage
+    run = patched.run
+
+    def timed(stage: Stage, num_substeps: int) -> None:
+        start = time.process_time()
+        run(stage, num_substeps)
+        clock.physics += time.process_time() - start
+
+    patched.run = timed
+    start = time.process_time()
+    try:
+        yield
+    finally:
+        clock.whole += time.process_time() - start
+        patched.run = run
+
+
+def random_play(env: CreateEnv, seed: int, num_decisions: int) -> int:
+    """Plays with uniform tools and positions; the number of episodes that ended."""
+    rng = np.random.default_rng(seed)
+    indices = rng.integers(env.config.action_set_size, size=num_decisions).tolist()
+    positions = rng.uniform(-1.0, 1.0, (num_decisions, 2))
+    env.reset(seed=seed)
+    num_ends = 0
+    for index, position in zip(indices, positions, strict=True):
+        _, _, terminated, truncated, _ = env.step({"index": index, "position": position})
+        if terminated or truncated:
+            num_ends += 1
+            env.reset()
+    return num_ends
+
+
+def crowded_env(level: str, num_tools: int) -> CreateEnv:
+    """An environment at the start of an episode, with random tools placed in it."""
+    config = CreateConfig(observation="none", action_ids="universe")
+    env = CreateEnv(level, config=config)
+    env.reset(seed=0)
+    rng = np.random.default_rng(0)
+    for _ in range(_MAX_TRIES):
+        if len(env.world.tools) == num_tools:
+            return env
+        tool, (x, y) = all_tools()[rng.integers(config.no_op_id)], rng.uniform(-1, 1, 2).tolist()
+        env.world.place(tool, (x, y))
+    raise AssertionError(f"No room for {num_tools} tools in {level}.")
+
+
+def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
+    """Random play of one level with gray, RGB and no observations, and the share of the physics."""
+    envs = {
+        name: CreateEnv(level, config=CreateConfig(observation=name)) for name in (*_DRAWN, "none")
+    }
+    timings = m.measure(
+        {name: _subject(env, num_decisions) for name, env in envs.items()}, m.REPEATS.value
+    )
+    for name, timing in timings.items():
+        report.timing(
+            f"{level}, observation {name}",
+            timing,
+            work={"decisions": num_decisions, "substeps": num_decisions * SUBSTEPS},
+            num_envs=1,
+            includes=["auto-reset"] + ["rendering"] * (name in _DRAWN),
+            how=f"random play, {num_decisions} decisions, one process",
+        )
+    for name in _DRAWN:
+        share = m.share_saved(timings[name], timings["none"])
+        report.values(f"{level}, share of drawing {name}", share, how="1 - none / drawn")
+    clock = Clock()
+    with timed_physics(clock):
+        random_play(envs["gray"], 0, num_decisions)
+    report.values(
+        f"{level}, share of the physics",
+        {"cpu": clock.physics / clock.whole},
+        how="inside Space.step / all, observation gray, auto-reset",
+        num_envs=1,
+    )
+
+
+def _subject(env: CreateEnv, num_decisions: int) -> m.Subject:
+    def play(seed: int) -> int:
+        return random_play(env, seed, num_decisions)
+
+    return m.Subject(play, lambda key: (int(jax.random.bits(key, dtype="uint16")),))
+
+
+def measure_frames(report: m.Report, num_frames: int) -> None:
+    """A frame of Push alone, at the start and with ten tools."""
+    for num_tools in (0, _NUM_TOOLS):
+        world = crowded_env("Push", num_tools).world
+        timings = m.measure(
+            {
+                mode: m.Subject(_draw_often(world.sprites, mode, num_frames), lambda key: ())
+                for mode in _DRAWN
+            },
+            m.REPEATS.value,
+        )
+        for mode, timing in timings.items():
+            report.timing(
+                f"one {mode} frame, Push with {num_tools} tools",
+                timing,
+                work={"frames": num_frames},
+                includes=["rendering"],
+                how=f"{num_frames} times the same world",
+            )
+
+
+def _draw_often(sprites: Callable, mode: str, num_frames: int) -> Callable[[], None]:
+    def call() -> None:
+        for _ in range(num_frames):
+            draw(sprites(), mode)
+
+    return call
+
+
+def main() -> None:
+    report = m.Report("create")
+    report.add_versions("pymunk", "gymnasium")
+    for level in LEVELS.value:
+        measure_play(report, level, 20 if m.QUICK.value else 300)
+    measure_frames(report, 10 if m.QUICK.value else 2000)
+
+
+if __name__ == "__main__":
+    m.run_benchmark(main)

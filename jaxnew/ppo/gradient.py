@@ -1,0 +1,200 @@
+"""The gradient steps of PPO (spec method 6), wherever the rollout was made."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+
+from jaxnew.policy import PolicyMethod
+from jaxnew.ppo.advantages import gae
+from jaxnew.ppo.config import PPOConfig
+from jaxnew.ppo.objective import Hyperparameters, Minibatch, loss, normalize_advantages
+from jaxnew.rollout.batch import RolloutBatch
+from jaxnew.sampling import AvailableSet
+
+Metrics = dict[str, jax.Array]
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that a run goes on from.
+
+    Attributes:
+      params: of the policy method.
+      opt_state: of Adam.
+      rollout: environments, sets and running statistics.
+      key: PRNG key of the run, never advanced: update `j` uses `fold_in(key, j)`.
+      step: int32[] number of updates done.
+    """
+
+    params: Any
+    opt_state: Any
+    rollout: Any
+    key: jax.Array
+    step: jax.Array
+
+
+@dataclass(frozen=True)
+class GradientSteps:
+    """What learners share: the gradient steps on one rollout. All methods are pure.
+
+    Attributes:
+      rollout: has the `method` that is trained.
+      config: shapes and counts.
+    """
+
+    rollout: Any
+    config: PPOConfig
+
+    @property
+    def method(self) -> PolicyMethod:
+        method: PolicyMethod = self.rollout.method
+        return method
+
+    @property
+    def optimizer(self) -> optax.GradientTransformation:
+        """Gradient clipping and Adam without its learning rate, which is traced."""
+        return optax.chain(
+            optax.clip_by_global_norm(self.config.max_grad_norm),
+            optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-5),
+        )
+
+    def init_state(
+        self,
+        key_run: jax.Array,
+        key_params: jax.Array,
+        observation: jax.Array,
+        representation_size: int,
+        rollout: Any,
+    ) -> TrainState:
+        """A state before the first update; consumes `key_params`, and `key_run` becomes the run's.
+
+        Args:
+          observation: one, as the policy sees it.
+          representation_size: d.
+          rollout: its state.
+        """
+        params = self.method.init(key_params, observation, representation_size)
+        return TrainState(params, self.optimizer.init(params), rollout, key_run, jnp.int32(0))
+
+    def learn(
+        self,
+        key: jax.Array,
+        params: Any,
+        opt_state: Any,
+        batch: RolloutBatch,
+        hyperparameters: Hyperparameters,
+        table: jax.Array,
+        step: jax.Array,
+        fixed_set: AvailableSet | None = None,
+    ) -> tuple[Any, Any, Metrics]:
+        """Gradient steps on one rollout; consumes `key`. Returns (params, opt_state, metrics)."""
+        terminated = batch.done if self.config.time_limits_are_ends else batch.terminated
+        advantages, value_targets = gae(
+            batch.reward,
+            batch.value,
+            batch.next_value,
+            terminated,
+            batch.done,
+            hyperparameters.discount,
+            hyperparameters.gae_lambda,
+        )
+        transitions = Minibatch(
+            observation=jnp.zeros_like(batch.done),  # Looked up per minibatch.
+            available=batch.available,
+            sample=batch.sample,
+            log_prob=batch.log_prob,
+            value=batch.value,
+            advantage=normalize_advantages(advantages),
+            value_target=value_targets,
+        )
+        transitions = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), transitions)
+        learning_rate = hyperparameters.learning_rate * self._learning_rate_factor(step)
+
+        def gradient_step(carry: tuple[Any, Any], indices: jax.Array) -> tuple[Any, Metrics]:
+            params, opt_state = carry
+            minibatch = jax.tree.map(lambda x: x[indices], transitions)
+            minibatch = replace(minibatch, observation=batch.observations(indices))
+            grads, metrics = self._gradient(params, minibatch, hyperparameters, table, fixed_set)
+            updates, opt_state = self.optimizer.update(grads, opt_state, params)
+            params = optax.apply_updates(
+                params, jax.tree.map(lambda u: -learning_rate * u, updates)
+            )
+            metrics["gradient_norm"] = optax.tree.norm(grads)
+            return (params, opt_state), metrics
+
+        indices = self._minibatch_indices(key)
+        (params, opt_state), metrics = jax.lax.scan(gradient_step, (params, opt_state), indices)
+        nonfinite = {
+            f"nonfinite/{name}": jnp.sum(~jnp.isfinite(values)).astype(jnp.float32)
+            for name, values in {
+                "loss": metrics["loss/total"],
+                "gradient": metrics["gradient_norm"],
+                "advantage": advantages,
+            }.items()
+        }
+        metrics = jax.tree.map(jnp.mean, metrics)
+        residual_variance = jnp.var(value_targets - batch.value)
+        metrics["value/explained_variance"] = 1.0 - residual_variance / (
+            jnp.var(value_targets) + 1e-8
+        )
+        metrics["learning_rate"] = learning_rate
+        return params, opt_state, {**metrics, **nonfinite}
+
+    def _learning_rate_factor(self, step: jax.Array) -> jax.Array:
+        """Linear from 1 to 0.1 over `lr_updates`, then constant (spec method 6)."""
+        return 1.0 - 0.9 * jnp.minimum(1.0, step / self.config.lr_updates)
+
+    def _minibatch_indices(self, key: jax.Array) -> jax.Array:
+        """int32[epochs * minibatches, B]: a fresh permutation of all transitions per epoch."""
+        keys = jax.random.split(key, self.config.num_epochs)
+        orders = [jax.random.permutation(k, self.config.steps_per_update) for k in keys]
+        return jnp.stack(orders).reshape(-1, self.config.minibatch_size)
+
+    def _gradient(
+        self,
+        params: Any,
+        minibatch: Minibatch,
+        hyperparameters: Hyperparameters,
+        table: jax.Array,
+        fixed_set: AvailableSet | None = None,
+    ) -> tuple[Any, Metrics]:
+        """Gradient of the minibatch's loss, and the metrics of it.
+
+        What can be available is projected once; microbatches add up the gradient of the projected
+        rows, which one backward pass then carries into the parameters of the projection.
+        """
+        rows = table if fixed_set is None else table[fixed_set.ids]
+        projected, pull_back = jax.vjp(lambda p: self.method.project(p, rows), params)
+
+        def gradient_of(part: Minibatch) -> tuple[Any, Metrics]:
+            return jax.grad(loss, argnums=(0, 1), has_aux=True)(
+                params, projected, part, self.method, hyperparameters, fixed_set
+            )
+
+        size = self.config.microbatch_size
+        if size in (0, self.config.minibatch_size):
+            grads, metrics = gradient_of(minibatch)
+        else:
+            parts = jax.tree.map(lambda x: x.reshape(-1, size, *x.shape[1:]), minibatch)
+            grads, metrics = _mean_over(gradient_of, parts)
+        grads_direct, grad_rows = grads
+        return jax.tree.map(jnp.add, grads_direct, pull_back(grad_rows)[0]), metrics
+
+
+def _mean_over(function: Any, parts: Any) -> Any:
+    """The mean of `function` over the leading axis of `parts`, one part at a time."""
+    num_parts = jax.tree.leaves(parts)[0].shape[0]
+    shapes = jax.eval_shape(function, jax.tree.map(lambda x: x[0], parts))
+    zeros = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+
+    def add(total: Any, part: Any) -> tuple[Any, None]:
+        return jax.tree.map(jnp.add, total, function(part)), None
+
+    total, _ = jax.lax.scan(add, zeros, parts)
+    return jax.tree.map(lambda x: x / num_parts, total)

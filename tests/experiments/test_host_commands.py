@@ -1,0 +1,122 @@
+"""The commands on a domain whose environments run on the host, each in a process of its own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from experiments._training import load_state, load_trainer
+from jaxnew import metrics
+from jaxnew.checkpoint import Checkpointer
+from jaxnew.task import Task
+from tests.experiments.commands import ROOT, read_json, run
+from tests.toy_task import TASK
+
+pytestmark = pytest.mark.integration
+
+PLACE = "--task=tests.toy_task:TASK"
+COMMON = (PLACE, "--representation=gt4", "--budget=smoke")
+
+
+@pytest.fixture(scope="module")
+def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    runs = tmp_path_factory.mktemp("runs")
+    run("train", *COMMON, f"--runs={runs}", "--workers=1")
+    return runs / "toy" / "ours-gt4-default-smoke-31"
+
+
+def test_train_save_and_evaluate_in_a_new_process(trained: Path) -> None:
+    lines = metrics.read(trained)
+    assert lines[-1]["step"] == 4
+    assert any("validation/is_success" in line for line in lines)
+    assert any("time/rollout_s" in line for line in lines)
+    results = []
+    for _ in range(2):
+        run("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7")
+        results.append(read_json(trained / "evaluation" / "test-best-sampled-m4.json"))
+    assert results[0]["metrics"] == results[1]["metrics"]
+    assert (results[0]["num_actions"], results[0]["num_episodes"]) == (6, 7)
+    assert set(results[0]["metrics"]) == {"is_success", "episode_return", "num_steps"}
+
+
+def test_finetune_with_the_test_actions(trained: Path, tmp_path: Path) -> None:
+    # Of another seed, whose fresh parameters are others.
+    flags = ("--budget=smoke", "--seed=7", f"--workdir={tmp_path / 'warm'}")
+    run("finetune", f"--run={trained}", *flags)
+    config = read_json(tmp_path / "warm" / "config.json")
+    assert (config["trained_on"], config["method"]) == ("test", "no-subsampling")
+    _, source, _ = load_trainer(trained)
+    start = load_state(load_trainer(trained)[0], source, "best")[0].params
+    loaded, trainer, _ = load_trainer(tmp_path / "warm")
+    end = load_state(loaded, trainer, "latest")[0].params
+    fresh = trainer.init().params
+    trainer.close()
+
+    def distance(params: Any) -> float:
+        return float(
+            np.abs(end["critic"]["value"]["kernel"] - params["critic"]["value"]["kernel"]).max()
+        )
+
+    assert 0 < distance(start) < 0.1 * distance(fresh)
+
+
+def test_a_method_with_a_fixed_set_trains_and_is_evaluated(tmp_path: Path) -> None:
+    method = "--method=nearest-neighbour"
+    run("train", *COMMON, method, "--set=num_updates=1", f"--workdir={tmp_path / 'run'}")
+    run("evaluate", f"--run={tmp_path / 'run'}", "--episodes=3")
+    assert read_json(tmp_path / "run" / "evaluation" / "test-best-sampled-m4.json")["metrics"]
+
+
+def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) -> None:
+    killed = tmp_path / "killed"
+    command = [sys.executable, "-m", "experiments.train", *COMMON, f"--workdir={killed}"]
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+    )
+    while process.poll() is None and not Checkpointer(killed / "checkpoints").steps("latest"):
+        time.sleep(0.005)
+    assert process.poll() is None
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    assert Checkpointer(killed / "checkpoints").steps("latest")[-1] < 4
+    assert "resuming" in run("train", *COMMON, f"--workdir={killed}")
+    for kind in ("best", "latest"):
+        assert saved(killed, kind) == saved(trained, kind)
+    assert timeless(killed) == timeless(trained)
+
+
+def saved(path: Path, kind: str) -> Any:
+    """Hashes of all that a checkpoint holds."""
+    checkpointer = Checkpointer(path / "checkpoints")
+    step = checkpointer.steps(kind)[-1]
+    record = checkpointer._read_record(checkpointer._path(kind, step))
+    assert any("environments" in leaf["path"] for leaf in record["leaves"])
+    return step, [(leaf["path"], leaf["sha256"]) for leaf in record["leaves"]]
+
+
+def timeless(path: Path) -> list[dict[str, Any]]:
+    lines = metrics.read(path)
+    return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in lines]
+
+
+def test_sweep_says_what_to_do(tmp_path: Path) -> None:
+    output = run("sweep", *COMMON, f"--runs={tmp_path}", fails=True)
+    assert "toy run on the host" in output
+    assert "python -m experiments.train` once per --seed" in output
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.unit
+def test_a_task_has_one_kind_of_environment() -> None:
+    with pytest.raises(ValueError, match="Task none needs one of make_environment and host"):
+        Task(name="none", make_universe=TASK.make_universe, splits=TASK.splits, stage_two={})
+    with pytest.raises(ValueError, match="environments of this task run on the host"):
+        TASK.make_environment()
