@@ -56,7 +56,7 @@ TASK = Task(
             hyperparameters=_HYPERPARAMETERS,
             loop=_LOOP,
             final_episodes=5000,
-            cost="minutes",
+            cost="about 6 minutes on one core",
         ),
         "paper": StageTwoBudget(
             num_updates=4882,
@@ -64,7 +64,7 @@ TASK = Task(
             hyperparameters=_HYPERPARAMETERS,
             loop=_LOOP,
             final_episodes=5000,
-            cost="hours",
+            cost="about 2 hours on one core",
         ),
         # Fully observable: twice the steps (spec method 6).
         "paper-mu": StageTwoBudget(
@@ -73,7 +73,7 @@ TASK = Task(
             hyperparameters=_HYPERPARAMETERS,
             loop=_LOOP,
             final_episodes=5000,
-            cost="hours",
+            cost="about 4 hours on one core",
         ),
     },
     selection_metric="click_through_rate",
