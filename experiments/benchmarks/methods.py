@@ -3,8 +3,8 @@
     python -m experiments.benchmarks.methods
 
 The Recommender draws sets of 500 products. What grows with the sets is measured by ablation, as in
-`training`: the update against the same with a cheap stand-in for drawing sets, for the utility of
-gathered rows, and for both the utility and the gathering.
+`training`: the update against the same with a cheap stand-in for the utility of gathered rows, and
+for both the utility and the gathering; the rollout against one that draws no sets.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.ppo import TrainState
 
 TASKS = ("grid_world", "recommender")
-PARTS = ("set drawing", "utility", "utility and gathering")
+PARTS = ("utility", "utility and gathering")
 
 
 def update_subject(trainer: Trainer) -> m.Subject:
@@ -56,19 +56,42 @@ class OneNumber(SumOfRow):
 
 
 def part_subjects(trainer: Trainer) -> dict[str, m.Subject]:
-    """The update of ours with cheap stand-ins for what it does with its sets."""
+    """The update of ours with cheap stand-ins for what it does with the rows of its sets."""
     learner = trainer.learner
-    rollout = learner.rollout
-    counted = CountedSets(rollout.env, rollout.env_params, rollout.method, rollout.config)
-    variants = {
-        "set drawing": counted,
-        "utility": replace(rollout, method=SumOfRow()),
-        "utility and gathering": replace(rollout, method=OneNumber()),
-    }
+    variants = {"utility": SumOfRow(), "utility and gathering": OneNumber()}
     return {
-        name: update_subject(replace(trainer, learner=replace(learner, rollout=variant)))
-        for name, variant in variants.items()
+        name: update_subject(
+            replace(
+                trainer,
+                learner=replace(learner, rollout=replace(learner.rollout, method=method)),
+            )
+        )
+        for name, method in variants.items()
     }
+
+
+def rollout_subjects(trainer: Trainer) -> dict[str, m.Subject]:
+    """A rollout of ours, and one whose sets are counted off.
+
+    Not an update: gradients of counted sets, which are neighbours in the table, are cheaper too.
+    """
+    start, numbers = trainer.init(), trainer.config.hyperparameters
+    whole = trainer.learner.rollout
+    counted = CountedSets(whole.env, whole.env_params, whole.method, whole.config)
+
+    def inputs(key: jax.Array) -> tuple[Any, ...]:
+        pool = trainer.training_pool
+        return key, start.rollout, start.params, trainer.table, pool, numbers.discount
+
+    return {
+        "rollout": m.compiled(whole.collect, inputs),
+        "rollout without set drawing": m.compiled(counted.collect, inputs),
+    }
+
+
+def title(name: str) -> str:
+    """What a subject is called in the report."""
+    return f"ours without {name}" if name in PARTS else name
 
 
 def main() -> None:
@@ -80,13 +103,13 @@ def main() -> None:
             if name not in ("no-entropy", "random")  # The same program as ours, and no method.
         }
         subjects = {name: update_subject(trainer) for name, trainer in trainers.items()}
-        subjects |= part_subjects(trainers["ours"])
+        subjects |= part_subjects(trainers["ours"]) | rollout_subjects(trainers["ours"])
         timings = m.measure(subjects, m.REPEATS.value)
         for name, timing in timings.items():
             trainer = trainers.get(name, trainers["ours"])
             steps = trainer.config.ppo.steps_per_update
             report.timing(
-                f"{task}: {name}" if name in trainers else f"{task}: ours without {name}",
+                f"{task}: {title(name)}",
                 timing,
                 work={"steps": steps},
                 num_envs=trainer.config.ppo.rollout.num_envs,
@@ -109,6 +132,11 @@ def main() -> None:
             how = "1 - time with a cheap stand-in / time of an update of ours, of medians"
             share = m.share_saved(timings["ours"], timings[name])
             report.values(f"{task}: share of {name}", share, how=how)
+        drawing = m.share_saved(timings["rollout"], timings["rollout without set drawing"])
+        of_update = m.ratio(timings["rollout"], timings["ours"])
+        values = {clock: share * of_update[clock] for clock, share in drawing.items()}
+        how = "what the rollout saves with sets that are counted off / time of an update of ours"
+        report.values(f"{task}: share of set drawing", values, how=how)
 
 
 if __name__ == "__main__":
