@@ -79,6 +79,7 @@ def main() -> None:
                 "devices_of_a_leaf": len(leaf.sharding.device_set),
                 "error_in_turn": max(errors[1]),
                 "error_two_at_once": max(errors[2]),
+                "median_error_two_at_once": float(np.median(errors[2])),
                 "seven_members_on_six_devices_use": len(seven.devices),
             }
         )
