@@ -114,12 +114,16 @@ def test_training_goes_on_where_it_was() -> None:
 
 @pytest.mark.unit
 def test_halves_rest_when_their_episodes_are_over() -> None:
+    """Of five episodes the first of four environments plays two, and the second half two in all."""
     environments = host.environments_of(4, 2)
-    evaluator_of(environments).run(host.params_of(), None, TABLE, POOL, KEY, 2)
+    evaluator = evaluator_of(environments)
+    found = evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 5)["num_steps"]
     events = environments.pool.events
     assert events[0] == "reset_numbered"
-    assert ("send", 0) in events
-    assert ("send", 1) not in events
+    assert events.count(("send", 1)) == found[2:4].max()
+    assert events.count(("send", 0)) == max(found[0] + found[4], found[1])
+    evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 2)
+    assert events.count(("send", 1)) == found[2:4].max()
 
 
 @pytest.mark.unit
