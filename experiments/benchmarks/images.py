@@ -16,7 +16,7 @@ from jaxnew._convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.policy.state_encoder import ImageEncoder
 
 FORMS = {"columns": convolution_by_columns, "XLA": convolution_by_xla}
-SIZES = (16, 32, 64, 256)  # Of microbatches.
+SIZES = (8, 16, 32, 64, 256)  # Of microbatches.
 RATIO = "time of the first over time of the second"
 
 

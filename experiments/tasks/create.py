@@ -74,6 +74,7 @@ _PPO = PPOConfig(
         normalize_observations=False,
         normalize_rewards=False,
     ),
+    microbatch_size=16,  # Images: what one core computes fastest.
     lr_steps=100_000_000,
 )
 _HYPERPARAMETERS = Hyperparameters(entropy_coefficient=0.005)
