@@ -30,12 +30,12 @@ from envs_host.create.tools.splits import (
     analysis_split,
 )
 from envs_host.pool import HostPool
+from experiments.tasks._create_stage_one import STATE, STATE_HVAE
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
 from jaxnew.observations import RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
-from jaxnew.representation.modality import vector_modality
 from jaxnew.rollout.device import RolloutConfig
 from jaxnew.task import (
     ActionStudy,
@@ -118,14 +118,6 @@ _STAGE_TWO = {
     ),
 }
 
-# Spec method 3, column CREATE state.
-_HVAE = RepresentationConfig(
-    action_latent=128,
-    observation_latent=128,
-    recordings_per_action=464,
-    num_steps=80_000,
-)
-
 
 def _stage_one(
     num_recordings: int, hvae: RepresentationConfig, vae_steps: int, cost: str
@@ -150,17 +142,17 @@ def _stage_one(
 _STAGE_ONE = {
     "smoke": _stage_one(
         4,
-        replace(_HVAE, num_steps=4, recordings_per_action=2, actions_per_batch=8),
+        replace(STATE_HVAE, num_steps=4, recordings_per_action=2, actions_per_batch=8),
         4,
         "half a minute, most of it for recording 2,366 tools",
     ),
     "laptop": _stage_one(
         128,
-        replace(_HVAE, num_steps=4000, recordings_per_action=32, actions_per_batch=32),
+        replace(STATE_HVAE, num_steps=4000, recordings_per_action=32, actions_per_batch=32),
         2000,
         "nobody measured how long it takes",
     ),
-    "paper": _stage_one(1024, _HVAE, 10_000, "nobody measured how long it takes; days"),
+    "paper": _stage_one(1024, STATE_HVAE, 10_000, "nobody measured how long it takes; days"),
 }
 
 
@@ -179,7 +171,7 @@ def _play(spacing_deg: int) -> Play:
         record_block=PoolRecorder(angle_spacing=spacing_deg),
         block_actions=64,
         modalities={
-            "state": vector_modality("state", STATE_SIZE),
+            "state": STATE,
             "position": Modality("position", 2, "gaussian", 0, _positions_only),
         },
     )

@@ -18,7 +18,7 @@ class PPOConfig:
       microbatch_size: transitions whose gradient is computed at a time, then averaged over the
         minibatch; 0 computes the whole minibatch at once. The function is the same; on a CPU a few
         hundred keep the `[B, m, 64]` arrays in cache and make an update several times faster; of
-        images, 32.
+        images, 16.
       lr_steps: environment steps over which the learning rate falls to a tenth.
       max_grad_norm: bound on the global norm of the gradient.
       time_limits_are_ends: nothing is bootstrapped through a time limit. Spec method 6: the
