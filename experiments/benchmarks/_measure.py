@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import json
+import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -129,6 +130,14 @@ def measure(subjects: Mapping[str, Subject], repeats: int, seed: int = 0) -> dic
         )
         for name, subject in subjects.items()
     }
+
+
+def cpu_s_of(pids: Sequence[int]) -> float:
+    """Processor time of other processes since they began; NaN where it is not known."""
+    files = [Path(f"/proc/{pid}/schedstat") for pid in pids]
+    if not all(file.exists() for file in files):
+        return math.nan
+    return sum(int(file.read_text().split()[0]) for file in files) / 1e9
 
 
 def ratio(numerator: Timing, denominator: Timing) -> dict[str, float]:

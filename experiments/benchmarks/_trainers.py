@@ -21,7 +21,11 @@ REPRESENTATION_SIZE = 16  # Of the paper's HVAE in Grid World, and of products (
 
 
 def make_trainer(
-    set_size: int = 0, seed: int = 31, task: str = "grid_world", method: str = "ours"
+    set_size: int = 0,
+    seed: int = 31,
+    task: str = "grid_world",
+    method: str = "ours",
+    representation_size: int = REPRESENTATION_SIZE,
 ) -> Trainer:
     """A run at the paper's shapes on a random table; with `--quick` 4 x 16 steps and sets of 5.
 
@@ -33,7 +37,7 @@ def make_trainer(
     domain = Domain.of(load_task(task), None)
     budget = domain.task.stage_two["paper"]
     num_actions = domain.universe.num_actions
-    vectors = np.random.default_rng(0).normal(size=(num_actions, REPRESENTATION_SIZE))
+    vectors = np.random.default_rng(0).normal(size=(num_actions, representation_size))
     table = RepresentationTable(
         vectors=vectors.astype(np.float32),
         ids=np.arange(num_actions, dtype=np.int32),

@@ -6,13 +6,11 @@ python -m experiments.benchmarks.pool
 from __future__ import annotations
 
 import contextlib
-import math
 import statistics
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -40,13 +38,6 @@ class Way:
 
     decide: Callable[[np.ndarray, np.ndarray], object]
     pids: tuple[int, ...] = ()
-
-    def children_cpu_s(self) -> float:
-        """Processor time of the other processes since they began; NaN where it is not known."""
-        files = [Path(f"/proc/{pid}/schedstat") for pid in self.pids]
-        if not all(file.exists() for file in files):
-            return math.nan
-        return sum(int(file.read_text().split()[0]) for file in files) / 1e9
 
 
 def main() -> None:
@@ -113,7 +104,7 @@ def compare(
         return m.Subject(call, inputs)
 
     repeats, num_decisions = m.REPEATS.value, num_envs * num_steps
-    before = {case: way.children_cpu_s() for case, way in ways.items()}
+    before = {case: m.cpu_s_of(way.pids) for case, way in ways.items()}
     timings = m.measure({case: subject(way) for case, way in ways.items()}, repeats)
     for case, timing in timings.items():
         report.timing(
@@ -127,7 +118,7 @@ def compare(
     cpu_us = {}
     for case, way in ways.items():
         # The others are idle but for the calls, of which one was not counted.
-        children_s = (way.children_cpu_s() - before[case]) / (repeats + 1)
+        children_s = (m.cpu_s_of(way.pids) - before[case]) / (repeats + 1)
         cpu_us[case] = 1e6 * (statistics.median(timings[case].cpu_s) + children_s) / num_decisions
     report_overheads(report, name, timings, cpu_us, num_envs, num_decisions)
 

@@ -23,6 +23,7 @@ SUBJECTS = (
     "sweep",
     "pool",
     "create",
+    "host_training",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 

@@ -47,7 +47,8 @@ class HostLearner(GradientSteps):
     ) -> tuple[TrainState, Metrics]:
         """One rollout and the gradient steps on it; see `Learner.update`.
 
-        Beside its metrics, `time/rollout_s` and `time/learn_s`: seconds of the two parts.
+        Beside its metrics, `time/rollout_s` and `time/learn_s`, the seconds of the two parts, and
+        those of `HostRollout.collect`.
         """
         start = time.perf_counter()
         key_rollout, key_learn = jax.random.split(jax.random.fold_in(state.key, state.step))
@@ -67,9 +68,11 @@ class HostLearner(GradientSteps):
                 rollout.available if batch.available is None else None,
             )
         )
+        for name, value in sums.items():
+            key = name if name.startswith(TIME_PREFIX) else f"episodes/{name}"
+            metrics[key] = jnp.asarray(value)
         metrics = {
             **metrics,
-            **{f"episodes/{name}": jnp.asarray(value) for name, value in sums.items()},
             f"{TIME_PREFIX}rollout_s": jnp.float32(collected - start),
             f"{TIME_PREFIX}learn_s": jnp.float32(time.perf_counter() - collected),
         }

@@ -7,6 +7,7 @@ at rest. The numbers depend on the keys alone, not on halves, workers or timing.
 
 from __future__ import annotations
 
+import time
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Any
@@ -16,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxnew.metrics import TIME_PREFIX
 from jaxnew.policy import PolicyMethod
 from jaxnew.rollout.acting import (
     WIDTH,
@@ -154,7 +156,9 @@ class HostRollout:
     ) -> tuple[HostRolloutState, RolloutBatch, dict[str, np.float32]]:
         """`num_steps` steps of every environment; see `DeviceRollout.collect`.
 
-        The batch is in NumPy. Step t of environment n acts from `fold_in(fold_in(key, t), n)`.
+        The batch is in NumPy. Step t of environment n acts from `fold_in(fold_in(key, t), n)`. The
+        metrics have `time/act_s` and `time/wait_s`, too: seconds in which the policy chose, and in
+        which it waited for the pool.
         """
         key_sets, key_samples = jax.random.split(key)
         run = _Run(self, state, params, table, pool, key_sets, key_samples)
@@ -169,7 +173,7 @@ class HostRollout:
             if self.config.has_fixed_set
             else AvailableSet(jnp.asarray(run.set_ids), state.available.mask),
         )
-        return next_state, run.batch(), record.sums()
+        return next_state, run.batch(), record.sums() | run.seconds()
 
     def _draw(self, keys: jax.Array, pool: ActionPool) -> AvailableSet:
         return draw_sets(keys, pool, self.config.set_size, self.config.padded_set_size or None)
@@ -236,6 +240,7 @@ class _Run:
         self.pool = rollout.environments.pool
         self.has_stacks = rollout.environments.has_stacks
         self.record = _Record(state, self.config.num_steps, self.pool.episode_metrics)
+        self.act_s, self.wait_s = 0.0, 0.0
         self.fixed_set = state.available if self.config.has_fixed_set else None
         rows = table if self.fixed_set is None else table[self.fixed_set.ids]
         self.projected = rollout.project(params, rows)
@@ -259,13 +264,20 @@ class _Run:
                 if t + 1 < self.config.num_steps:
                     self._act(t + 1, half)
 
+    def seconds(self) -> dict[str, np.float32]:
+        """Where this process spent its time, of what can be told apart."""
+        spent = {"act_s": self.act_s, "wait_s": self.wait_s}
+        return {TIME_PREFIX + name: np.float32(seconds) for name, seconds in spent.items()}
+
     def _act(self, t: int, half: int) -> None:
+        start = time.perf_counter()
         rows = self.rows(half)
         if self.fixed_set is None:
             self.all_ids[t, rows] = self.set_ids[rows]
         acting = self._in_blocks(rows, partial(self._act_in, t))
         self.record.acting[t].append(acting)
         self.pool.send(half, acting.ids, acting.positions)
+        self.act_s += time.perf_counter() - start
 
     def _act_in(self, t: int, envs: np.ndarray) -> Acting:
         available = self.fixed_set
@@ -285,7 +297,9 @@ class _Run:
 
     def _receive(self, t: int, half: int) -> None:
         rows = self.rows(half)
+        start = time.perf_counter()
         step = self.pool.receive(half)
+        self.wait_s += time.perf_counter() - start
         done = self.record.receive(t, rows, step)
         if self.config.bootstraps_time_limits and np.any(step.truncated):
             self.record.final_value[t, rows] = self._final_value(t, rows, step)

@@ -143,12 +143,11 @@ def test_overheads_of_made_up_timings(tmp_path: Path) -> None:
 def test_processor_time_of_other_processes() -> None:
     command = [sys.executable, "-c", "sum(range(10**7)); print(flush=True); input()"]
     with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        way = pool.Way(print, (process.pid,))
         assert process.stdout is not None
         process.stdout.readline()
-        assert 0.05 < way.children_cpu_s() < 30.0  # About 0.2 s, on any machine and start included.
+        assert 0.05 < m.cpu_s_of([process.pid]) < 30.0  # 0.2 s, start included.
         process.communicate(b"\n")
-    assert pool.Way(print).children_cpu_s() == 0.0
+    assert m.cpu_s_of([]) == 0.0
 
 
 @pytest.mark.unit
@@ -252,6 +251,18 @@ def test_the_clock_of_the_physics_is_taken_off_again() -> None:
         env.world.run(2000)
     assert 0.0 < clock.physics <= clock.whole
     assert create.Stage.run is run_before
+
+
+@pytest.mark.slow
+@pytest.mark.integration
+def test_shares_of_training_on_the_host_are_of_one_update(tmp_path: Path) -> None:
+    lines = {line["case"]: line["values"] for line in run_quick("host_training", tmp_path)}
+    training = lines["training"]
+    assert training["steps_per_s"] == pytest.approx(4 * 16 / training["update_s"])
+    shares = lines["shares of the wall clock"]
+    assert sum(shares.values()) == pytest.approx(1.0)
+    assert all(0.0 < share < 1.0 for share in shares.values())
+    assert min(lines["processor time, us per step"].values()) > 0.0
 
 
 @pytest.mark.slow
