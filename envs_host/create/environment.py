@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
@@ -224,7 +225,8 @@ class CreateEnv(gymnasium.Env):
     def _read(self, action: Action) -> tuple[Tool, Point]:
         """The tool and the position of an action."""
         try:
-            index, (x, y) = int(action["index"]), np.asarray(action["position"], np.float64)
+            index = int(action["index"])
+            x, y = np.asarray(action["position"], np.float64).tolist()
         except (KeyError, TypeError, ValueError, IndexError) as err:
             raise ValueError(
                 f"action={action!r} must be {{'index': int, 'position': [x, y]}}."
@@ -234,9 +236,9 @@ class CreateEnv(gymnasium.Env):
                 f"index={index} is not in 0..{len(self._available) - 1}, the places of the "
                 "available set."
             )
-        if not np.isfinite([x, y]).all():
+        if not (math.isfinite(x) and math.isfinite(y)):
             raise ValueError(f"position=({x}, {y}) must be two finite numbers in [-1, 1].")
-        return self._tools[self._available[index]], (float(x), float(y))
+        return self._tools[self._available[index]], (x, y)
 
     def _checked_candidates(self, candidates: Sequence[int] | np.ndarray | None) -> np.ndarray:
         if candidates is None:

@@ -10,7 +10,7 @@ from envs_host.create.config import CreateConfig
 from envs_host.create.geometry import Point, clip, is_in_bounds, scaled_distance
 from envs_host.create.layout import Layout
 from envs_host.create.tools import Tool
-from envs_host.create.world import Placement, World
+from envs_host.create.world import Placement, Positions, World
 
 _QUIET_ACTIONS_ALLOWED = 1
 
@@ -110,9 +110,10 @@ class Episode:
         summary = self.summary
         reward = self.config.rewards.alive + self._placement_reward()
         summary.length += 1
-        ends = self._common_ends()
+        now = self.world.positions
+        ends = self._common_ends(now)
         is_armed = summary.target_hit == 1 or not self.level.has_marker
-        dense = self._dense_reward(is_armed)
+        dense = self._dense_reward(now, is_armed)
         if is_armed and summary.goal_hit == 0 and self.world.has_touched_goal:
             summary.goal_hit = 1
             reward += self._rewards["goal"] - self._discount()
@@ -122,7 +123,7 @@ class Episode:
             0.0, self._rewards["subgoal"] - self._discount()
         )
         if self.level.has_marker:
-            reward += self._judge_marker(ends)
+            reward += self._judge_marker(now, ends)
         reward += subgoals + dense
         summary.reward += reward
         summary.subgoal_reward += subgoals
@@ -139,12 +140,12 @@ class Episode:
         """How much less a goal or subgoal is worth by now: 0.1 per placed tool (6.1)."""
         return self.config.rewards.per_tool_discount * self.summary.num_placed
 
-    def _common_ends(self) -> list[End]:
+    def _common_ends(self, now: Positions) -> list[End]:
         """The ends that every kind of level has (1.7)."""
         ends = []
         if self.summary.length > self.step_limit:
             ends.append(End.STEP_LIMIT)
-        if not is_in_bounds(self.world.positions.target):
+        if not is_in_bounds(now.target):
             ends.append(End.TARGET_OUT)
         # Never reset: the second quiet action ends, consecutive or not (A24).
         self._num_quiet += self.world.is_still(self.config.stop_speed)
@@ -152,22 +153,21 @@ class Episode:
             ends.append(End.STILL)
         return ends
 
-    def _judge_marker(self, ends: list[End]) -> float:
+    def _judge_marker(self, now: Positions, ends: list[End]) -> float:
         """The target's first hit, then the marker's bounds (1.6, step 8)."""
         reward = 0.0
-        if self.summary.target_hit == 0 and self._is_target_hit():
+        if self.summary.target_hit == 0 and self._is_target_hit(now.target):
             self.summary.target_hit = 1
             reward += self._rewards["target_hit"]
-        marker = self.world.positions.marker
-        assert marker is not None
-        if self.summary.target_hit == 0 and not is_in_bounds(marker):
+        assert now.marker is not None
+        if self.summary.target_hit == 0 and not is_in_bounds(now.marker):
             ends.append(End.MARKER_OUT)
             reward += self.config.rewards.marker_lost
         return reward
 
-    def _is_target_hit(self) -> bool:
-        """Whether the target has moved, and by the marker if it must (6.4)."""
-        start, now = self._start.target, self.world.positions.target
+    def _is_target_hit(self, now: Point) -> bool:
+        """Whether the target, now here, has moved, and by the marker if it must (6.4)."""
+        start = self._start.target
         has_moved = scaled_distance(start, now) > self.config.move_threshold
         if self.level.marker_must_hit_target:
             has_moved = has_moved and self.world.has_marker_hit_target
@@ -176,13 +176,12 @@ class Episode:
             has_moved = has_moved and (now[0] - start[0]) * towards_goal > 0.0
         return has_moved
 
-    def _dense_reward(self, is_armed: bool) -> float:
+    def _dense_reward(self, now: Positions, is_armed: bool) -> float:
         """The variant of spec create 6.6, before this action's goal is credited."""
         scale = self.config.rewards.dense_scale
         if scale == 0.0 or self.summary.goal_hit == 1:
             return 0.0
-        start, now = self._start, self.world.positions
-        gain = 0.0
+        start, gain = self._start, 0.0
         if is_armed:
             gain += scaled_distance(start.target, start.goal)
             gain -= scaled_distance(now.target, now.goal)

@@ -95,6 +95,10 @@ class World:
         self.frame = _frame() if frame_walls else []
         for thing in self._things():
             self.stage.add(thing)
+        # What may move, of the things whose speed counts.
+        self._movers = [
+            thing.body for thing in (self.target, self.goal, *self.objects) if thing.is_dynamic
+        ]
 
     @property
     def positions(self) -> Positions:
@@ -117,6 +121,8 @@ class World:
         if thing is not None:
             self.stage.add(thing)
             self.tools.append(thing)
+            if thing.is_dynamic:
+                self._movers.append(thing.body)
             self.tool_positions.append(position)
         return placement
 
@@ -160,12 +166,7 @@ class World:
 
         Only the linear speed of the main body counts (1.7); what is static is slow enough.
         """
-        moving = (
-            thing.body.velocity
-            for thing in (self.target, self.goal, *self.tools, *self.objects)
-            if thing.is_dynamic
-        )
-        return all(math.hypot(*velocity) < stop_speed for velocity in moving)
+        return all(math.hypot(*body.velocity) < stop_speed for body in self._movers)
 
     def sprites(self) -> Iterator[Sprite]:
         """What to draw, in drawing order."""
