@@ -20,24 +20,30 @@ FATAL = {"in-evaluation": 30, "in-update": 12}
 
 @contextlib.contextmanager
 def acted_ids(job: list[str]) -> Iterator[None]:
-    """Prints, after the job, the ids that environments were told (`acted`), and the restarts."""
+    """Prints, after the job, the ids that environments were told, and what their pools were like.
+
+    See `acted`. Of the pools: how many restarts they allowed, and how many the job left open.
+    """
     del job
     ids: set[int] = set()
-    restarts: set[int] = set()
+    pools: set[HostPool] = set()
     send = HostPool.send
 
     def noting(pool: HostPool, half: int, chosen: Any, positions: Any = None) -> None:
         ids.update(np.asarray(chosen).tolist())
-        restarts.add(pool._workers._max_restarts)
+        pools.add(pool)
         send(pool, half, chosen, positions)
 
     with mock.patch.object(HostPool, "send", noting):
         yield
-    print(f"acted: {json.dumps(sorted(ids))}\nrestarts: {sorted(restarts)}")
+    restarts = {pool._workers._max_restarts for pool in pools}
+    left_open = sum(not pool._workers.why_closed for pool in pools)
+    print(f"acted: {json.dumps(sorted(ids))}\nrestarts: {sorted(restarts)}, open: {left_open}")
 
 
 def acted(output: str) -> set[int]:
-    """The ids that `acted_ids` printed."""
+    """The ids that `acted_ids` printed, after a job that left nothing open."""
+    assert output.endswith(", open: 0\n"), output
     (found,) = re.findall(r"^acted: (\[.*\])$", output, re.MULTILINE)
     return set(json.loads(found))
 

@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from envs_host.create.levels import load_level
 from envs_host.create.tools import (
     analysis_split,
     angle_test_ids,
@@ -36,7 +37,7 @@ from tests.experiments.several import run_several
 
 pytestmark = pytest.mark.integration
 
-WIDTH = 32  # Of every representation but one, so that the policies share their programs.
+WIDTH = 32  # Of every representation, so that policies share their programs.
 EPISODES = 6
 ACTED_IDS = "tests.experiments.create_probes:acted_ids"
 COMMON = ("--budget=smoke", "--workers=1")
@@ -68,7 +69,7 @@ RUNS = {
     "collide": Run("create-collide", "continuous"),
     "moving": Run("create-moving", "nearest-neighbour"),
     "basket": Run("create-basket", "no-subsampling"),
-    "funnel": Run("create-funnel", representation="random-16"),
+    "funnel": Run("create-funnel", representation="random-32"),
     "conditioned": Run("create-push", flags=(*SHORT, "--set=conditions_position=true")),
     "no-subgoals": Run("create-push-no-subgoals"),
     "full": Run("create-push", flags=(*SHORT, "--split=full"), split="full"),
@@ -170,7 +171,8 @@ def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: dict[str, str],
     for metric, row in found["metrics"].items():
         assert row["low"] <= row["mean"] <= row["high"], metric
     assert all(0.0 <= mean[metric] <= 1.0 for metric in ("is_success", "target_hit"))
-    assert 1.0 <= mean["num_steps"] == mean["episode_length"] <= 31.0
+    longest = load_level(RUNS[name].task.split("-")[1].capitalize()).step_limit + 1
+    assert 1.0 <= mean["num_steps"] == mean["episode_length"] <= longest
     counted = mean["num_placed"] + mean["num_blocked"] + mean["num_no_op"]
     assert counted == pytest.approx(mean["num_steps"], abs=1e-5)
     # Spec create 6.1: 0.01 for each action that is not blocked, subgoals, the target's hit; up to
@@ -194,17 +196,14 @@ def test_what_methods_are_made_of(runs: Path, trained: dict[str, str]) -> None:
     fixed = {name for name in RUNS if config[name]["ppo"]["rollout"]["has_fixed_set"]}
     assert fixed == {"moving", "basket"}
     assert size["basket"] == size["push"], "the utility takes any number of tools"
-    assert [shape for shape in size["moving"].values() if num_train in shape]
+    assert size["buckets"] == size["push"], "a random policy has heads for positions all the same"
+    assert size["moving"]["policy.logits.kernel"] == (64, num_train)
     assert not [key for key in size["moving"] if key.startswith("utility")]
     assert config["collide"]["ppo"]["rollout"]["num_steps"] == 8, "2/3 of 12"
-    assert [shape for shape in size["collide"].values() if shape == (64, WIDTH)]
+    assert size["collide"]["policy.mean.kernel"] == (64, WIDTH)
     assert not [key for key in size["collide"] if key.startswith("utility")]
-    heads = {
-        name: {key: shape for key, shape in size[name].items() if key.startswith("auxiliary")}
-        for name in ("push", "conditioned")
-    }
-    assert heads["push"] != heads["conditioned"]
-    assert [shape for shape in heads["conditioned"].values() if shape[0] == 128], "[f(s), a]"
+    assert size["push"]["auxiliary.heads.alpha.kernel"] == (64, 2)
+    assert size["conditioned"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
 
 
 def test_representations_are_those_that_were_asked_for(runs: Path, trained: dict[str, str]) -> None:
@@ -219,7 +218,7 @@ def test_representations_are_those_that_were_asked_for(runs: Path, trained: dict
     mine = np.load(runs / "mine.npz")["vectors"].astype(np.float32)
     np.testing.assert_array_equal(used["cannon"].vectors, mine)
     np.testing.assert_array_equal(used["push"].vectors, tool_universe().engineered["gt32"])
-    assert used["funnel"].vectors.shape == (2366, 16)
+    assert used["funnel"].vectors.shape == (2366, WIDTH)
     assert used["analysis"].vectors.shape == (10_877, 32)
     names = (*embedded, "cannon", "push", "funnel", "analysis")
     assert len({used[name].hash for name in names}) == len(names), "no two are the same"
@@ -264,10 +263,10 @@ def test_finetuning_of_each_kind(runs: Path, trained: dict[str, str], tmp_path: 
         moved = {
             k: np.abs(found[k] - source[k]).max() for k in found if k in source and k[0] in "ce"
         }
-        # Four Adam steps of 1e-3 or less, against parameters of another seed.
-        assert (max(moved.values()) < 0.01) == (start == "warm")
+        # At most 12 steps of Adam by about 1e-3 each, against parameters of another seed.
+        assert (max(moved.values()) < 0.02) == (start == "warm")
         if method == "nearest-neighbour":
-            assert [v.shape for v in found.values() if len(split.test) + 1 in v.shape]
+            assert found["policy.logits.kernel"].shape == (64, len(split.test) + 1)
 
 
 Expected = Callable[[np.ndarray], np.ndarray]
