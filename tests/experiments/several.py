@@ -51,7 +51,7 @@ def run_several(
         input=json.dumps([[str(flag) for flag in job] for job in jobs]),
         capture_output=True,
         text=True,
-        timeout=900,
+        timeout=1800,
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
