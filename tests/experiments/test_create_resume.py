@@ -123,7 +123,7 @@ def test_a_command_ends_with_the_error_of_the_worker_and_what_to_do() -> None:
         "from envs_host.pool import WorkerError\n"
         "from experiments import _flags\n"
         "def main():\n"
-        "    raise WorkerError(1, ((31, (2, 5)),), Lost('was killed by SIGKILL'))\n"
+        "    raise WorkerError(1, [2], ((31, (2, 5)),), Lost('was killed by SIGKILL'))\n"
         "_flags.run_command(main)\n"
     )
     done = subprocess.run(
