@@ -24,26 +24,32 @@ class WorkerError(RuntimeError):
     Attributes:
       worker: its index.
       environments: indices of its environments.
-      seeds: (seed, (environment, episode)) of their running episodes:
-        `np.random.SeedSequence(seed, spawn_key=(environment, episode))` starts one again.
+      seeds: (seed, spawn key) of their running episodes: `np.random.SeedSequence(seed,
+        spawn_key=spawn_key)` starts one again. A key is (environment, episode), in an evaluation
+        (number of the episode,).
       environment: the one that was at work when the worker raised; None where that is not known.
       reason: what happened.
       traceback: of the exception in the worker; empty if there was none.
     """
 
     def __init__(
-        self, worker: int, seeds: tuple[tuple[int, tuple[int, ...]], ...], lost: Lost
+        self,
+        worker: int,
+        environments: Sequence[int],
+        seeds: tuple[tuple[int, tuple[int, ...]], ...],
+        lost: Lost,
     ) -> None:
         self.worker, self.seeds, self.reason = worker, seeds, str(lost)
-        self.environments = tuple(key[0] for _, key in seeds)
+        self.environments = tuple(environments)
         self.environment = None if lost.failure is None else lost.failure.environment
         self.traceback = "" if lost.failure is None else lost.failure.traceback
         what = "" if self.environment is None else f", in environment {self.environment}"
         keys = ", ".join(str(key) for _, key in seeds)
+        parts = "(environment, episode)" if len(seeds[0][1]) == 2 else "(number of the episode,)"
         super().__init__(
             f"Worker {worker} {self.reason}{what}.\nIt held environments "
-            f"{list(self.environments)}, with seed {seeds[0][0]} and spawn keys (environment, "
-            f"episode) {keys}.\n{self.traceback}".rstrip()
+            f"{list(self.environments)}, with seed {seeds[0][0]} and spawn keys {parts} "
+            f"{keys}.\n{self.traceback}".rstrip()
         )
 
 
@@ -199,7 +205,7 @@ class Workers:
 
     def _error(self, w: int, lost: Lost) -> WorkerError:
         environments = _environments(self._workers[w].setup.halves)
-        return WorkerError(w, self._episodes.seeds(environments), lost)
+        return WorkerError(w, environments, self._episodes.seeds(environments), lost)
 
     def checksums(self, environments: Iterable[int]) -> np.ndarray:
         """int64[n] of the environments' observations, -1 where a step may have overwritten them."""

@@ -20,7 +20,7 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -28,8 +28,9 @@ from envs_host._channel import FIRST_CODE
 from envs_host._episodes import Episodes
 from envs_host._memory import Setup
 from envs_host._workers import ReplayMismatch, WorkerError, Workers
+from envs_host.settings import PoolSettings, WorkerDeath
 
-__all__ = ["HostPool", "HostStep", "ReplayMismatch", "WorkerError"]
+__all__ = ["HostPool", "HostStep", "PoolSettings", "ReplayMismatch", "WorkerError"]
 
 
 @dataclass(frozen=True)
@@ -71,14 +72,7 @@ class HostPool:
       num_workers: processes, at most N / num_halves.
       seed: of everything random, 0 .. 2^63 - 1.
       num_halves: 2, or 1 for no overlap; more are possible.
-      on_worker_death: where a worker dies, raises or gives no answer, "raise" a `WorkerError` and
-        close the pool, or "restart": replace it exactly, with a warning in the log of this module.
-      timeout_s: how long a worker may be silent while `receive` waits for it, which includes other
-        halves that it has to finish first.
-      start_timeout_s: how long a worker may take to import the factory and to make its
-        environments.
-      max_restarts: in the life of the pool; where one more is needed, it raises.
-      pin_cores: worker w keeps to the w-th of the cores that this process may use, in turn.
+      on_worker_death, timeout_s, start_timeout_s, max_restarts, pin_cores: see `PoolSettings`.
 
     Raises:
       ValueError: an argument is not as above.
@@ -94,13 +88,14 @@ class HostPool:
         seed: int,
         *,
         num_halves: int = 2,
-        on_worker_death: Literal["raise", "restart"] = "raise",
-        timeout_s: float = 60.0,
-        start_timeout_s: float = 120.0,
-        max_restarts: int = 10,
-        pin_cores: bool = False,
+        on_worker_death: WorkerDeath = PoolSettings.on_worker_death,
+        timeout_s: float = PoolSettings.timeout_s,
+        start_timeout_s: float = PoolSettings.start_timeout_s,
+        max_restarts: int = PoolSettings.max_restarts,
+        pin_cores: bool = PoolSettings.pin_cores,
     ) -> None:
-        _check_arguments(num_envs, num_workers, seed, num_halves, on_worker_death)
+        _check_arguments(num_envs, num_workers, seed, num_halves)
+        PoolSettings(on_worker_death, timeout_s, start_timeout_s, max_restarts, pin_cores)
         self.num_envs, self.num_halves, self.num_workers = num_envs, num_halves, num_workers
         self._episodes = Episodes(seed, num_envs)
         self._workers = Workers(
@@ -346,9 +341,7 @@ def _read_only(array: np.ndarray) -> np.ndarray:
     return view
 
 
-def _check_arguments(
-    num_envs: int, num_workers: int, seed: int, num_halves: int, on_worker_death: str
-) -> None:
+def _check_arguments(num_envs: int, num_workers: int, seed: int, num_halves: int) -> None:
     if not 1 <= num_halves < FIRST_CODE:
         raise ValueError(f"num_halves={num_halves} must be 1 .. {FIRST_CODE - 1}.")
     if num_envs < 1 or num_envs % num_halves:
@@ -362,8 +355,6 @@ def _check_arguments(
             "environments of every half."
         )
     _check_seed(seed)
-    if on_worker_death not in ("raise", "restart"):
-        raise ValueError(f"on_worker_death={on_worker_death!r} must be 'raise' or 'restart'.")
 
 
 def _check_seed(seed: int) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 
 from absl import app, flags, logging
 
+from envs_host.pool import WorkerError
 from jaxnew.task import Task
 
 TASK = flags.DEFINE_string("task", "grid_world", "Task name, or package.module:TASK.")
@@ -37,7 +38,12 @@ OVERWRITE = flags.DEFINE_bool("overwrite", False, "Replace an existing run inste
 WORKERS = flags.DEFINE_integer(
     "workers", 0, "Processes for environments on the host; 0: one per core.", lower_bound=0
 )
-SET = flags.DEFINE_multi_string("set", [], "path.to.field=value, for any field of the config.")
+SET = flags.DEFINE_multi_string(
+    "set",
+    [],
+    "path.to.field=value, for any field of the config; pool.FIELD=value, such as "
+    "pool.on_worker_death=restart, says how environments on the host are run.",
+)
 DEBUG_NANS = flags.DEFINE_bool("debug_nans", False, "Stop at the operation that makes a NaN.")
 
 
@@ -116,7 +122,8 @@ def configure_jax() -> None:
 
     cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "jaxnew"))
     jax.config.update("jax_compilation_cache_dir", cache)
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
     jax.config.update("jax_debug_nans", DEBUG_NANS.value)
 
 
@@ -130,9 +137,18 @@ def run_command(main: Callable[[], None]) -> None:
         configure_jax()
         try:
             main()
-        except (ValueError, ArithmeticError) as err:
+        except (ValueError, ArithmeticError, WorkerError) as err:
             if DEBUG_NANS.value or os.environ.get("JAXNEW_TRACEBACK"):
                 raise
-            sys.exit(f"{type(err).__name__}: {err}\n(JAXNEW_TRACEBACK=1 shows where.)")
+            sys.exit(f"{type(err).__name__}: {err}\n{_advice(err)}")
 
     app.run(wrapped)
+
+
+def _advice(err: Exception) -> str:
+    if isinstance(err, WorkerError):
+        return (
+            "The same command goes on from the last checkpoint; with "
+            "--set=pool.on_worker_death=restart it replaces workers that are lost."
+        )
+    return "(JAXNEW_TRACEBACK=1 shows where.)"

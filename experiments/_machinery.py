@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, make_dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from experiments._flags import UsageError
+from jaxnew import config as config_lib
 from jaxnew.evaluation import Evaluator
 from jaxnew.host_evaluation import HostEvaluator
 from jaxnew.policy import PolicyMethod
@@ -120,3 +123,34 @@ def machinery_of(
     environments = task.host.environments(rollout.num_envs, seed, num_workers)
     learner = HostLearner(HostRollout(environments, method, rollout), config)
     return HostMachinery(learner, HostEvaluator(environments, method, *sizes), task.host)
+
+
+def pool_assignments(assignments: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Those of the form `pool.FIELD=value`, which say how a run is computed, and the others.
+
+    The others say what a run is and belong to its config.
+    """
+    groups = [a.partition("=")[0].strip().split(".")[0] for a in assignments]
+    mine = [a for a, group in zip(assignments, groups, strict=True) if group == "pool"]
+    return mine, [a for a, group in zip(assignments, groups, strict=True) if group != "pool"]
+
+
+def with_pool_settings(task: Task, assignments: Sequence[str]) -> Task:
+    """A task whose pool is run as `pool.FIELD=value` says.
+
+    Raises:
+      UsageError: an assignment is not of that form, or the task has no pool that could be told.
+      ConfigError: there is no such field, or it takes no such value.
+    """
+    mine, others = pool_assignments(assignments)
+    if others:
+        raise UsageError(f"{others[0]}: the run is there; only --set=pool.FIELD=value can be set.")
+    if not mine:
+        return task
+    settings = None if task.host is None else task.host.pool_settings
+    if task.host is None or settings is None:
+        kind = "has environments inside jit" if task.host is None else "has a pool without settings"
+        raise UsageError(f"{mine[0]}: task {task.name} {kind}; leave out --set=pool.*.")
+    tree = make_dataclass("Settings", [("pool", type(settings))], frozen=True)
+    changed: Any = config_lib.set_paths(tree(settings), mine)
+    return replace(task, host=replace(task.host, pool_settings=changed.pool))

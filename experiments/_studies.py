@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 from collections.abc import Callable, Sequence
+from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -238,25 +239,26 @@ def _evaluations(
     state, step = load_state(run, trainer, "best")
     (known,) = read_runs([path])
     rows = []
-    for value in axis:
-        condition = kind.condition((trainer, split, encoder), value)
-        found = [e for e in known.evaluations if _is(e, condition, num_episodes)]
-        if found:
-            rows.append(found[0])
-            continue
-        used = trainer if condition.table is None else replace(trainer, table=condition.table)
-        row = evaluate_on(
-            used,
-            state,
-            condition.name,
-            condition.ids,
-            split,
-            num_episodes=num_episodes,
-            **condition.options,
-        )
-        record(run, condition.name, "best", step, row)
-        print(f"{path}: {kind.axis} {value:g} done in {row['seconds']} s", flush=True)
-        rows.append(row)
+    with closing(trainer):
+        for value in axis:
+            condition = kind.condition((trainer, split, encoder), value)
+            found = [e for e in known.evaluations if _is(e, condition, num_episodes)]
+            if found:
+                rows.append(found[0])
+                continue
+            used = trainer if condition.table is None else replace(trainer, table=condition.table)
+            row = evaluate_on(
+                used,
+                state,
+                condition.name,
+                condition.ids,
+                split,
+                num_episodes=num_episodes,
+                **condition.options,
+            )
+            record(run, condition.name, "best", step, row)
+            print(f"{path}: {kind.axis} {value:g} done in {row['seconds']} s", flush=True)
+            rows.append(row)
     return rows
 
 

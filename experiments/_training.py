@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,7 +15,7 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
-from experiments._machinery import DeviceMachinery, HostMachinery, machinery_of
+from experiments._machinery import DeviceMachinery, HostMachinery, machinery_of, with_pool_settings
 from experiments._methods import adapted, file_name, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
@@ -297,8 +298,15 @@ def save_inputs(run: RunDirectory, split: ActionSplit, table: RepresentationTabl
         table.save(run.path / TABLE_FILE)
 
 
-def load_trainer(path: Path, num_workers: int = 0) -> tuple[RunDirectory, Trainer, ActionSplit]:
+def load_trainer(
+    path: Path, num_workers: int = 0, pool_assignments: Sequence[str] = ()
+) -> tuple[RunDirectory, Trainer, ActionSplit]:
     """A run's config and parts, from its directory alone; see `Trainer.of`.
+
+    Args:
+      path: the run directory.
+      num_workers: see `Trainer.of`.
+      pool_assignments: see `with_pool_settings`.
 
     Raises:
       RunDirectoryError: `path` is not a run of `train`.
@@ -306,7 +314,7 @@ def load_trainer(path: Path, num_workers: int = 0) -> tuple[RunDirectory, Traine
     """
     run = RunDirectory.load(path)
     config = TrainConfig.from_plain(run.config)
-    task = load_task(config.task)
+    task = with_pool_settings(load_task(config.task), pool_assignments)
     split = ActionSplit.load(path / SPLIT_FILE)
     split.check(task.make_universe())
     table = RepresentationTable.load(path / TABLE_FILE)

@@ -45,7 +45,7 @@ def main() -> None:
         raise flag.UsageError("Say which run to evaluate: --run=DIRECTORY.")
     path, kind = locate(Path(RUN.value))
     kind = kind or CHECKPOINT.value
-    run, trainer, split = load_trainer(path, flag.WORKERS.value)
+    run, trainer, split = load_trainer(path, flag.WORKERS.value, flag.SET.value)
     if TABLE.value is not None:
         new = RepresentationTable.load(Path(TABLE.value))
         trainer = dataclasses.replace(trainer, table=with_new_rows(trainer.table, new))

@@ -21,6 +21,7 @@ from absl import flags
 
 from experiments import _flags as flag
 from experiments._artifacts import TABLE_FILE
+from experiments._machinery import pool_assignments
 from experiments._methods import adapted
 from experiments._training import (
     TrainConfig,
@@ -49,7 +50,8 @@ def main() -> None:
     if RUN.value is None:
         raise flag.UsageError("Say which run to fine-tune: --run=DIRECTORY.")
     source_path = Path(RUN.value)
-    source_run, source, split = load_trainer(source_path)
+    pool, assignments = pool_assignments(flag.SET.value)
+    source_run, source, split = load_trainer(source_path, flag.WORKERS.value, pool)
     table = RepresentationTable.load(source_path / TABLE_FILE)
     config = config_lib.set_paths(
         config_of(
@@ -60,7 +62,7 @@ def main() -> None:
             SCRATCH.value,
             flag.SEED.value,
         ),
-        flag.SET.value,
+        assignments,
     )
     trainer = Trainer.of(config, source.task, split, table, flag.WORKERS.value)
     state = trainer.init()

@@ -11,6 +11,7 @@ from absl import flags
 
 from experiments import _flags as flag
 from experiments._artifacts import Domain, find_table
+from experiments._machinery import pool_assignments, with_pool_settings
 from experiments._methods import variant_of
 from experiments._training import train_policy
 
@@ -20,7 +21,9 @@ REPRESENTATION_BUDGET = flags.DEFINE_string(
 
 
 def main() -> None:
-    domain = Domain.of(flag.load_task(flag.TASK.value), flag.SPLIT.value)
+    pool, assignments = pool_assignments(flag.SET.value)
+    task = with_pool_settings(flag.load_task(flag.TASK.value), pool)
+    domain = Domain.of(task, flag.SPLIT.value)
     runs = Path(flag.RUNS.value)
     variant_of(flag.METHOD.value)  # Before a representation is trained for it.
     table = find_table(
@@ -37,7 +40,7 @@ def main() -> None:
         flag.BUDGET.value,
         method=flag.METHOD.value,
         seed=flag.SEED.value,
-        assignments=flag.SET.value,
+        assignments=assignments,
         workdir=Path(flag.WORKDIR.value) if flag.WORKDIR.value else None,
         overwrite=flag.OVERWRITE.value,
         num_workers=flag.WORKERS.value,

@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Protocol
+from typing import Any
 
 import jax
 import numpy as np
@@ -148,35 +148,32 @@ class Measured:
     evaluation: float
 
 
-class MakePool(Protocol):
-    """Makes a pool of host environments; numbers must not depend on halves and workers."""
-
-    def __call__(
-        self, *, num_envs: int, num_halves: int, num_workers: int, seed: int
-    ) -> HostPool: ...
-
-
 @dataclass(frozen=True)
 class HostDomain:
     """Environments that run on the host, in a pool.
 
     Attributes:
-      make_pool: a pool; see `MakePool` and `jaxnew.rollout.pool.HostPool`.
+      make_pool: `(*, num_envs, num_halves, num_workers, seed)`, and `settings` too where there are
+        `pool_settings` -> a `jaxnew.rollout.pool.HostPool` whose numbers do not depend on halves,
+        workers and settings.
       action_spec: of the actions; there is no stop bit.
       observation_spec: of one observation of the pool. `uint8[height, width]` are frames, which the
         policy sees as stacks; other shapes it sees as they are.
       max_episode_steps: length of the longest episode.
       stack_size: frames in a stack.
+      pool_settings: frozen dataclass, how workers are run; `--set=pool.FIELD=value` changes it.
+        None: there is nothing to set.
 
     Raises:
       ValueError: the actions have a stop bit.
     """
 
-    make_pool: MakePool
+    make_pool: Callable[..., HostPool]
     action_spec: ActionSpec
     observation_spec: ObservationSpec
     max_episode_steps: int
     stack_size: int = 1
+    pool_settings: Any = None
 
     def __post_init__(self) -> None:
         if self.action_spec.has_stop:
@@ -207,6 +204,7 @@ class HostDomain:
             num_halves=num_halves,
             num_workers=num_workers,
             seed=seed,
+            **({} if self.pool_settings is None else {"settings": self.pool_settings}),
         )
         return HostEnvironments(make, self.max_episode_steps, self.stack_size)
 

@@ -6,7 +6,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from typing import Any
 
@@ -29,7 +29,7 @@ from envs_host.create.tools.splits import (
     ANALYSIS_UNSEEN_RATIOS,
     analysis_split,
 )
-from envs_host.pool import HostPool
+from envs_host.pool import HostPool, PoolSettings
 from experiments.tasks._create_stage_one import STATE, STATE_HVAE
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
@@ -192,7 +192,13 @@ def _analysis(universe: ActionUniverse, seed: int) -> ActionSplit:
 
 
 def _make_pool(
-    kwargs: dict[str, Any], *, num_envs: int, num_halves: int, num_workers: int, seed: int
+    kwargs: dict[str, Any],
+    *,
+    num_envs: int,
+    num_halves: int,
+    num_workers: int,
+    seed: int,
+    settings: PoolSettings,
 ) -> HostPool:
     return HostPool(
         "envs_host.create.hosting:CreateHost",
@@ -201,6 +207,7 @@ def _make_pool(
         num_workers,
         seed,
         num_halves=num_halves,
+        **asdict(settings),
     )
 
 
@@ -264,6 +271,7 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             observation_spec=ObservationSpec((FRAME_SIZE, FRAME_SIZE), np.uint8, 0, 255),
             max_episode_steps=definition.step_limit + 1,
             stack_size=3,
+            pool_settings=PoolSettings(),
         ),
         play=_PLAY[spacing],
         stage_one=_STAGE_ONE,

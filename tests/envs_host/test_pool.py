@@ -281,6 +281,9 @@ def test_a_gymnasium_environment_in_a_pool() -> None:
         ({"seed": -1}, "seed=-1 must be 0"),
         ({"seed": 2**63}, "must be 0 .. 2"),
         ({"on_worker_death": "ignore"}, "'ignore' must be 'raise' or 'restart'"),
+        ({"timeout_s": 0.0}, "timeout_s=0.0 must be above 0 seconds"),
+        ({"start_timeout_s": -1.0}, "start_timeout_s=-1.0 must be above 0 seconds"),
+        ({"max_restarts": -1}, "max_restarts=-1 must be 0 or more"),
         ({"kwargs": {"split": np.zeros(3)}}, "must be plain numbers"),
     ],
 )

@@ -63,6 +63,25 @@ def assert_same(found: list[np.ndarray], expected: list[np.ndarray]) -> None:
 
 
 @pytest.mark.integration
+def test_a_fault_in_an_evaluation_names_environments_and_numbers_of_episodes() -> None:
+    with HostPool(FAULTY, {"fault": "raise"}, NUM_ENVS, 2, SEED) as pool:
+        pool.reset_numbered(seed=5)
+        steps = actions()
+        while pool.episodes[3] == 0:
+            pool.step(*steps[0])
+        episodes = pool.episodes
+        with pytest.raises(WorkerError) as caught:
+            pool.step(np.array([0, 0, 0, BAD]), steps[0][1])
+    keys = [(int(episodes[i]) * NUM_ENVS + i,) for i in (1, 3)]
+    assert caught.value.environments == (1, 3)
+    assert caught.value.seeds == tuple((5, key) for key in keys)
+    assert (
+        "It held environments [1, 3], with seed 5 and spawn keys (number of the episode,) "
+        f"{keys[0]}, {keys[1]}.\n"
+    ) in str(caught.value)
+
+
+@pytest.mark.integration
 @pytest.mark.parametrize(
     ("fault", "reason", "detail"),
     [

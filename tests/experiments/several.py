@@ -1,0 +1,95 @@
+"""Runs one command several times in one new process: `python -m tests.experiments.several`.
+
+Starting Python, importing JAX and compiling take most of a smoke run's time, and are paid once
+here. `run_several` starts it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import json
+import os
+import subprocess
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tests.experiments.commands import ROOT
+
+# Programs that are compiled fast rather than fast programs, and all of them kept on disk. Runs
+# whose bits are compared have to be of one kind.
+ENVIRONMENT = {
+    "XLA_FLAGS": "--xla_backend_optimization_level=0",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+}
+_FAILED = "Traceback (most recent call last)"
+
+
+def run_several(
+    module: str,
+    jobs: Sequence[Sequence[str | Path]],
+    *,
+    probe: str = "contextlib:nullcontext",
+    may_fail: bool = False,
+) -> list[str]:
+    """What `python -m experiments.MODULE JOB` prints for each job, all of them in one new process.
+
+    Args:
+      module: of `experiments`.
+      jobs: the flags of each.
+      probe: `package.module:NAME` of `job -> context manager`, in which the job is done.
+      may_fail: a job's output may end with a traceback; later jobs are done all the same.
+    """
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.experiments.several", module, probe],
+        cwd=ROOT,
+        env={**os.environ, **ENVIRONMENT},
+        input=json.dumps([[str(flag) for flag in job] for job in jobs]),
+        capture_output=True,
+        text=True,
+        timeout=1800,
+        check=False,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    outputs: list[str] = json.loads(done.stdout)
+    failed = [output for output in outputs if _FAILED in output]
+    assert may_fail or not failed, "\n".join(failed)
+    return outputs
+
+
+def main(module: str, probe: str, jobs: list[list[str]]) -> list[str]:
+    """Does the jobs; see `run_several`."""
+    command: Any = importlib.import_module(f"experiments.{module}")
+    from absl import logging
+
+    place, _, name = probe.partition(":")
+    around = getattr(importlib.import_module(place), name)
+    logging.set_verbosity(logging.WARNING)
+    return [_output(command, job, around) for job in jobs]
+
+
+def _output(command: Any, job: list[str], around: Any) -> str:
+    from absl import flags
+
+    from experiments._flags import configure_jax
+
+    for name in flags.FLAGS:
+        flags.FLAGS[name].unparse()
+    flags.FLAGS(["command", *job])
+    configure_jax()
+    text = io.StringIO()
+    with contextlib.redirect_stdout(text):
+        try:
+            with around(job):
+                command.main()
+        except Exception:
+            traceback.print_exc(file=text)
+    return text.getvalue()
+
+
+if __name__ == "__main__":
+    print(json.dumps(main(*sys.argv[1:], json.load(sys.stdin))))

@@ -1,0 +1,305 @@
+"""CREATE through the commands at smoke budget: train, save, and evaluate in another process.
+
+Every level, and on top every method, representation and variant: `RUNS` gives each of them to a
+level, since a run costs seconds. Then fine-tuning, and the studies of the analysis.
+"""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from envs_host.create.levels import load_level
+from envs_host.create.tools import (
+    analysis_split,
+    angle_test_ids,
+    embedding_test_ids,
+    mix_ids,
+    published_split,
+    tool_universe,
+)
+from experiments.tasks.create import LEVELS
+from jaxnew import metrics
+from jaxnew.actions import ActionSplit
+from jaxnew.checkpoint import Checkpointer
+from jaxnew.representation.table import RepresentationTable
+from tests.experiments.commands import read_json
+from tests.experiments.create_probes import acted
+from tests.experiments.create_runs import parameters
+from tests.experiments.several import run_several
+
+pytestmark = pytest.mark.integration
+
+WIDTH = 32  # Of every representation, so that policies share their programs.
+EPISODES = 6
+ACTED_IDS = "tests.experiments.create_probes:acted_ids"
+COMMON = ("--budget=smoke", "--workers=1")
+EMBED = "create/embed-{}-default-smoke-31"
+POOL = ("--set=pool.on_worker_death=restart", "--set=pool.max_restarts=3")
+SHORT = ("--set=num_updates=1", "--set=loop.evaluation_episodes=2")
+
+
+@dataclass(frozen=True)
+class Run:
+    """A run of `train`; `representation` may be a path below the folder of all runs."""
+
+    task: str
+    method: str = "ours"
+    representation: str = "gt32"
+    flags: tuple[str, ...] = SHORT
+    split: str = "default"
+
+
+RUNS = {
+    "push": Run("create-push", flags=()),
+    "obstacle": Run("create-obstacle", representation=EMBED.format("hvae")),
+    "seesaw": Run("create-seesaw", representation=EMBED.format("vae")),
+    "navigate": Run("create-navigate", representation=EMBED.format("hvae-oracle")),
+    "ladder": Run("create-ladder", representation=EMBED.format("hvae-position")),
+    "cannon": Run("create-cannon", representation="mine.npz"),
+    "belt": Run("create-belt", "no-entropy"),
+    "buckets": Run("create-buckets", "random"),
+    "collide": Run("create-collide", "continuous"),
+    "moving": Run("create-moving", "nearest-neighbour"),
+    "basket": Run("create-basket", "no-subsampling"),
+    "funnel": Run("create-funnel", representation="random-32"),
+    "conditioned": Run("create-push", flags=(*SHORT, "--set=conditions_position=true")),
+    "no-subgoals": Run("create-push-no-subgoals"),
+    "full": Run("create-push", flags=(*SHORT, "--split=full"), split="full"),
+    "analysis": Run("create-push-analysis"),
+}
+HIT_REWARD = {"create-obstacle": 2.0, "create-push-no-subgoals": 0.0}
+
+
+def split_of(name: str) -> ActionSplit:
+    return analysis_split() if name == "analysis" else published_split(RUNS[name].split)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings, four encoders and a table of the user's own."""
+    folder = tmp_path_factory.mktemp("runs")
+    jobs = []
+    for name in ("hvae", "vae", "hvae-oracle", "hvae-position"):
+        size = "observation_latent" if name == "vae" else "action_latent"
+        flags = (f"--representation={name}", f"--set=model.{size}={WIDTH}", f"--runs={folder}")
+        jobs.append(("--task=create-push", *COMMON, *flags))
+    run_several("embed", jobs)
+    vectors = np.random.default_rng(0).normal(size=(tool_universe().num_actions, WIDTH))
+    np.savez(folder / "mine.npz", ids=np.arange(len(vectors)), vectors=vectors)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def trained(runs: Path) -> dict[str, str]:
+    """What `train` printed for each of `RUNS`."""
+    jobs = []
+    for name, run in RUNS.items():
+        given = runs / run.representation
+        representation = given if given.exists() else run.representation
+        flags = (f"--representation={representation}", f"--workdir={runs / name}", *run.flags)
+        jobs.append((f"--task={run.task}", f"--method={run.method}", *COMMON, *flags))
+    return dict(zip(RUNS, run_several("train", jobs, probe=ACTED_IDS), strict=True))
+
+
+@pytest.fixture(scope="module")
+def evaluated(runs: Path, trained: dict[str, str]) -> dict[str, str]:
+    """What `evaluate` printed for each of `RUNS`, and for `push` in a world without subgoals."""
+    assert trained
+    twin = runs / "twin"
+    shutil.copytree(runs / "push", twin)
+    text = (twin / "config.json").read_text()
+    (twin / "config.json").write_text(text.replace('"create-push"', '"create-push-no-subgoals"'))
+    long = "--episodes=20"
+    jobs = [(f"--run={runs / name}", f"--episodes={EPISODES}", "--workers=1") for name in RUNS]
+    jobs += [(f"--run={runs / name}", "--sets=train", long) for name in ("push", "twin")]
+    names = [*RUNS, "push on train", "twin on train"]
+    return dict(zip(names, run_several("evaluate", jobs, probe=ACTED_IDS), strict=True))
+
+
+def evaluation(path: Path, name: str = "test") -> dict[str, Any]:
+    (file,) = (path / "evaluation").glob(f"{name}-best-sampled-m*.json")
+    found: dict[str, Any] = read_json(file)
+    return found
+
+
+def means(path: Path, name: str = "test") -> dict[str, float]:
+    return {key: row["mean"] for key, row in evaluation(path, name)["metrics"].items()}
+
+
+def test_every_level_is_there() -> None:
+    levels = {run.task.split("-")[1] for run in RUNS.values()}
+    assert levels == {level.lower() for level in LEVELS}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_is_trained_and_saved(runs: Path, trained: dict[str, str], name: str) -> None:
+    run, path, split = RUNS[name], runs / name, split_of(name)
+    updates = 2 if name == "push" else 1
+    config = read_json(path / "config.json")
+    table = RepresentationTable.load(path / "table.npz")
+    assert (config["task"], config["method"], config["split"]) == (run.task, run.method, run.split)
+    assert config["split_hash"] == split.hash
+    assert config["table_hash"] == table.hash
+    lines = metrics.read(path)
+    assert [line["step"] for line in lines if "loss/total" in line] == [*range(1, updates + 1)]
+    assert [line["step"] for line in lines if "validation/is_success" in line][-1] == updates
+    assert Checkpointer(path / "checkpoints").steps("latest")[-1] == updates
+    known = {*split.train.tolist(), *split.validation.tolist(), *split.always_available.tolist()}
+    chosen = acted(trained[name])
+    assert chosen <= known, "no test tool is used before the evaluation of test tools"
+    assert chosen & {*split.train.tolist()}
+    assert chosen & {*split.validation.tolist()}
+
+
+@pytest.mark.parametrize("name", RUNS)
+def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: dict[str, str], name: str) -> None:
+    split, found, mean = split_of(name), evaluation(runs / name), means(runs / name)
+    chosen = acted(evaluated[name])
+    assert chosen <= {*split.test.tolist(), *split.always_available.tolist()}
+    assert chosen & {*split.test.tolist()}
+    assert (found["num_episodes"], found["num_actions"]) == (EPISODES, len(split.test))
+    assert found["set_size"] == 5
+    assert found["step"] in (1, 2)
+    for metric, row in found["metrics"].items():
+        assert row["low"] <= row["mean"] <= row["high"], metric
+    assert all(0.0 <= mean[metric] <= 1.0 for metric in ("is_success", "target_hit"))
+    longest = load_level(RUNS[name].task.split("-")[1].capitalize()).step_limit + 1
+    assert 1.0 <= mean["num_steps"] == mean["episode_length"] <= longest
+    counted = mean["num_placed"] + mean["num_blocked"] + mean["num_no_op"]
+    assert counted == pytest.approx(mean["num_steps"], abs=1e-5)
+    # Spec create 6.1: 0.01 for each action that is not blocked, subgoals, the target's hit; up to
+    # 10 for the goal.
+    certain = 0.01 * (mean["num_steps"] - mean["num_blocked"]) + mean["subgoal_reward"]
+    certain += HIT_REWARD.get(RUNS[name].task, 1.0) * mean["target_hit"]
+    above = mean["episode_return"] - certain
+    assert -1e-5 <= above <= 10.0 * mean["is_success"] + 1e-5
+
+
+def test_what_methods_are_made_of(runs: Path, trained: dict[str, str]) -> None:
+    assert trained
+    config = {name: read_json(runs / name / "config.json") for name in RUNS}
+    size = {
+        name: {key: value.shape for key, value in parameters(runs / name).items()}
+        for name in ("push", "buckets", "collide", "moving", "basket", "conditioned")
+    }
+    num_train = len(published_split().train) + 1
+    entropy = {name: config[name]["hyperparameters"]["entropy_coefficient"] for name in RUNS}
+    assert {name for name, value in entropy.items() if value == 0.0} == {"belt"}
+    fixed = {name for name in RUNS if config[name]["ppo"]["rollout"]["has_fixed_set"]}
+    assert fixed == {"moving", "basket"}
+    assert size["basket"] == size["push"], "the utility takes any number of tools"
+    assert size["buckets"] == size["push"], "a random policy has heads for positions all the same"
+    assert size["moving"]["policy.logits.kernel"] == (64, num_train)
+    assert not [key for key in size["moving"] if key.startswith("utility")]
+    assert config["collide"]["ppo"]["rollout"]["num_steps"] == 8, "2/3 of 12"
+    assert size["collide"]["policy.mean.kernel"] == (64, WIDTH)
+    assert not [key for key in size["collide"] if key.startswith("utility")]
+    assert size["push"]["auxiliary.heads.alpha.kernel"] == (64, 2)
+    assert size["conditioned"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
+
+
+def test_representations_are_those_that_were_asked_for(runs: Path, trained: dict[str, str]) -> None:
+    assert trained
+    used = {name: RepresentationTable.load(runs / name / "table.npz") for name in RUNS}
+    embedded = {name: run.representation for name, run in RUNS.items() if "/" in run.representation}
+    for name, representation in embedded.items():
+        config = read_json(runs / representation / "config.json")
+        assert config["train_on"] == ("all" if "oracle" in representation else "train")
+        assert used[name].hash == RepresentationTable.load(runs / representation / "table.npz").hash
+        assert metrics.read(runs / representation)[-1]["step"] == 4
+    mine = np.load(runs / "mine.npz")["vectors"].astype(np.float32)
+    np.testing.assert_array_equal(used["cannon"].vectors, mine)
+    np.testing.assert_array_equal(used["push"].vectors, tool_universe().engineered["gt32"])
+    assert used["funnel"].vectors.shape == (2366, WIDTH)
+    assert used["analysis"].vectors.shape == (10_877, 32)
+    names = (*embedded, "cannon", "push", "funnel", "analysis")
+    assert len({used[name].hash for name in names}) == len(names), "no two are the same"
+    assert all(np.isfinite(used[name].vectors).all() for name in names)
+
+
+def test_subgoals_and_hits_are_worth_nothing_without_them(
+    runs: Path, evaluated: dict[str, str]
+) -> None:
+    """The same policy does the same in both worlds, and is paid for the target's hit in one."""
+    assert acted(evaluated["push on train"]) == acted(evaluated["twin on train"])
+    with_hits, without = means(runs / "push", "train"), means(runs / "twin", "train")
+    assert with_hits["target_hit"] > 0.0
+    paid = with_hits.pop("episode_return") - without.pop("episode_return")
+    assert paid == pytest.approx(with_hits["target_hit"], abs=1e-5)
+    assert with_hits == without
+
+
+def test_finetuning_of_each_kind(runs: Path, trained: dict[str, str], tmp_path: Path) -> None:
+    """Both policies, warm and from scratch, with all test tools as one set (spec method 9)."""
+    assert trained
+    sources = {"ours": "push", "nearest-neighbour": "moving"}
+    kinds = [(method, start) for method in sources for start in ("warm", "scratch")]
+    jobs = []
+    for method, start in kinds:
+        flags = ("--seed=7", *POOL, *(["--scratch"] if start == "scratch" else []))
+        workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
+        jobs.append((f"--run={runs / sources[method]}", *COMMON, *flags, workdir))
+    outputs = run_several("finetune", jobs, probe=ACTED_IDS)
+    split = published_split()
+    test = {*split.test.tolist(), *split.always_available.tolist()}
+    for (method, start), output in zip(kinds, outputs, strict=True):
+        path = tmp_path / f"{method}-{start}"
+        config = read_json(path / "config.json")
+        assert acted(output) <= test
+        assert "restarts: [3]" in output
+        assert config["trained_on"] == "test"
+        assert config["method"] == {"ours": "no-subsampling"}.get(method, method)
+        assert config["start"] == {"warm": f"{method}, seed 31"}.get(start, "fresh parameters")
+        assert metrics.read(path)[-1]["step"] == 1
+        found, source = parameters(path), parameters(runs / sources[method])
+        moved = {
+            k: np.abs(found[k] - source[k]).max() for k in found if k in source and k[0] in "ce"
+        }
+        # At most 12 steps of Adam by about 1e-3 each, against parameters of another seed.
+        assert (max(moved.values()) < 0.02) == (start == "warm")
+        if method == "nearest-neighbour":
+            assert found["policy.logits.kernel"].shape == (64, len(split.test) + 1)
+
+
+Expected = Callable[[np.ndarray], np.ndarray]
+STUDIES: dict[str, tuple[str, Expected]] = {
+    "angle": ("15", lambda table: angle_test_ids(15)),
+    "angle-per-class": ("9", lambda table: angle_test_ids(9, per_class=True)),
+    "embedding": ("2.5", lambda table: embedding_test_ids(table, 2.5)),
+    "mix": ("0.4", lambda table: mix_ids(table, 0.4, 0)),
+}
+
+
+def test_studies_of_the_analysis(runs: Path, trained: dict[str, str], tmp_path: Path) -> None:
+    assert trained
+    path = runs / "analysis"
+    jobs = [
+        (
+            f"--study={name}",
+            f"--run={path}",
+            f"--values={value}",
+            "--episodes=4",
+            f"--out={tmp_path}",
+        )
+        for name, (value, _) in STUDIES.items()
+    ]
+    outputs = run_several("analyze", jobs, probe=ACTED_IDS)
+    table = RepresentationTable.load(path / "table.npz").vectors
+    for (name, (value, expected)), output in zip(STUDIES.items(), outputs, strict=True):
+        ids = expected(table)
+        no_op = analysis_split().always_available
+        assert acted(output) <= {*ids.tolist(), *no_op.tolist()}
+        found = evaluation(path, f"{name}-{value}")
+        assert (found["num_actions"], found["num_episodes"]) == (len(ids), 4)
+        file = tmp_path / f"{name.replace('-', '_')}.csv"
+        (row,) = csv.DictReader(file.open())
+        assert float(row["mean"]) == found["metrics"]["is_success"]["mean"]
+        assert file.with_suffix(".png").stat().st_size > 5_000
