@@ -57,21 +57,21 @@ def draw_poses(
 
     Args:
       ids: int[n] the tool of each recording.
-      poses: f64[n, 7, 4, 3], see `record_poses`.
+      poses: f64[n, T, 4, 3], see `record_poses`.
       angle_spacing: degrees; which list of tools ids belong to.
 
     Returns:
-      u8[n, 7, 48, 48, 1] grays.
+      u8[n, T, 48, 48, 1] grays.
 
     Raises:
       ValueError: `poses` are not one recording for each id.
     """
-    if poses.shape != (len(ids), *POSES_SHAPE):
+    if poses.ndim != 4 or len(poses) != len(ids) or poses.shape[2:] != POSES_SHAPE[1:]:
         raise ValueError(
-            f"poses must be {(len(ids), *POSES_SHAPE)}, one recording for each id; got shape "
-            f"{poses.shape}."
+            f"poses must be [{len(ids)}, T, {MAX_SPRITES}, {POSE_SIZE}], one recording for each "
+            f"id; got shape {poses.shape}."
         )
-    frames = np.empty((len(ids), *FRAMES_SHAPE), np.uint8)
+    frames = np.empty((*poses.shape[:2], *FRAMES_SHAPE[1:]), np.uint8)
     # Plain numbers, because sprites of NumPy's are slow to draw.
     for tool_id, of_recording, frames_of in zip(ids.tolist(), poses.tolist(), frames, strict=True):
         looks = _looks(tool_id, angle_spacing)

@@ -73,7 +73,7 @@ class RepresentationLearner:
             optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
         )
         self._run = jax.jit(self._run_steps)
-        self._step = jax.jit(self._step_on, static_argnames="num_actions")
+        self._step = jax.jit(self._step_on)
         self._choices = jax.jit(self._choices_of, static_argnames=("shape", "num_steps"))
         self._posterior = jax.jit(self._posterior_of)
 
@@ -267,7 +267,7 @@ class RepresentationLearner:
         batch = source.gather(rows[0], numbers[0])
         totals: Metrics = {}
         for i in range(num_steps):
-            state, metrics = self._step(state, batch, num_actions=shape[0])
+            state, metrics = self._step(state, batch, jnp.int32(shape[0]))
             # One step computes and at most one waits while the next batch is gathered.
             jax.block_until_ready(totals)
             totals = jax.tree.map(jnp.add, totals, metrics) if totals else metrics
@@ -284,7 +284,7 @@ class RepresentationLearner:
         return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
 
     def _step_on(
-        self, state: RepresentationState, batch: jax.Array, num_actions: int
+        self, state: RepresentationState, batch: jax.Array, num_actions: jax.Array
     ) -> tuple[RepresentationState, Metrics]:
         """One gradient step on a batch [B, S, T, D0] of `num_actions` train actions."""
         epoch = self._epoch(state, num_actions)
@@ -336,7 +336,7 @@ class RepresentationLearner:
         key_batch, key_noise = jax.random.split(jax.random.fold_in(state.key_steps, state.step))
         return key_batch, key_noise
 
-    def _epoch(self, state: RepresentationState, num_actions: int) -> jax.Array:
+    def _epoch(self, state: RepresentationState, num_actions: int | jax.Array) -> jax.Array:
         """int32[] this step's epoch; of pooled recordings it is one step (spec method 4)."""
         if self._pools_recordings:
             return state.step
