@@ -1,6 +1,6 @@
 """The toy of `tests/toy_host.py`, whose actions are 24 tools of CREATE on video.
 
-`--task=tests.video_task:TASK`. Videos have three frames, so that programs compile quickly.
+`--task=tests.video_task:TASK`. Videos have two frames, so that programs compile quickly.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jaxnew.representation.modality import image_modality, vector_modality
 from jaxnew.task import Drawing, Play, StageOneBudget
 from tests import toy_host, toy_task
 
-FIRST, NUM_FRAMES = 2, 3
+FIRST, NUM_FRAMES = 3, 2
 TOOL_OF = 98 * np.arange(toy_host.NUM_ACTIONS, dtype=np.int32)
 TOOL_OF[toy_task.NO_OP] = no_op_id()
 
@@ -44,7 +44,7 @@ _HVAE = RepresentationConfig(
     observation_latent=4,
     actions_per_batch=3,
     recordings_per_action=2,
-    num_steps=6,
+    num_steps=4,
 )
 _SMOKE = StageOneBudget(
     num_recordings=3,

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
-import signal
-import subprocess
-import sys
-import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +11,20 @@ import numpy as np
 import pytest
 
 from envs_host.create.play import record_images
-from experiments._artifacts import REPRESENTATION_SEED, Domain, parse_representation
+from experiments._artifacts import (
+    REPRESENTATION_SEED,
+    Domain,
+    parse_representation,
+    train_representation,
+)
 from experiments._flags import UsageError, load_task
 from experiments._recordings import collect
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
+from jaxnew.representation.sources import DrawnRecordings, StoredRecordings
 from jaxnew.representation.table import RepresentationTable
 from tests import video_task
-from tests.experiments.commands import ROOT, read_json, run
+from tests.experiments.commands import read_json, run
 
 PLACE = "--task=tests.video_task:TASK"
 COMMON = (PLACE, "--representation=hvae-video", "--budget=smoke")
@@ -30,15 +32,19 @@ TOY = "toy-video"
 ENCODER = "embed-hvae-video-default-smoke-31"
 
 
+SEEN = slice(video_task.FIRST, video_task.FIRST + video_task.NUM_FRAMES)
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded and encoded, with frames drawn on demand."""
+    """Recorded, encoded and trained by the commands, with frames drawn on demand."""
     runs = tmp_path_factory.mktemp("runs")
     output = run("collect", *COMMON, f"--runs={runs}")
     assert "24 actions x 3 recordings take 0.0 MB where frames are drawn on demand" in output
-    assert "0.5 MB where they are stored (--frames=stored); they are drawn on demand" in output
+    assert "0.3 MB where they are stored (--frames=stored); they are drawn on demand" in output
     assert sorted(path.name for path in (runs / TOY).iterdir()) == ["poses-3"]
     run("embed", *COMMON, f"--runs={runs}")
+    run("train", *COMMON, f"--runs={runs}", "--workers=1", "--set=num_updates=1")
     return runs
 
 
@@ -49,97 +55,84 @@ def test_the_encoder_is_trained_and_describes_every_action(runs: Path) -> None:
     assert table.vectors.shape == (24, 4)
     assert len(np.unique(table.vectors, axis=0)) == 24
     lines = [line for line in metrics.read(folder) if "loss" in line]
-    assert [line["step"] for line in lines] == [1, 2, 3, 4, 5, 6]
+    assert [line["step"] for line in lines] == [1, 2, 3, 4]
     assert lines[-1]["loss"] < lines[0]["loss"]
 
 
 @pytest.mark.integration
-def test_stored_frames_give_the_same_run_to_the_bit(runs: Path, tmp_path: Path) -> None:
-    """From the poses and by itself; the stored frames are those of the simulations."""
-    output = run("embed", *COMMON, f"--runs={tmp_path}", "--frames=stored")
-    assert "; they are stored." in output
-    assert sorted(path.name for path in (tmp_path / TOY).glob("*-3")) == ["frames-3", "poses-3"]
-    frames = np.load(tmp_path / TOY / "frames-3" / "recordings.npy")
-    expected = record_images(REPRESENTATION_SEED, video_task.TOOL_OF, 3)[:, :, 2:5]
-    np.testing.assert_array_equal(frames[..., 0], expected)
-    assert_same_run(tmp_path / TOY / ENCODER, runs / TOY / ENCODER)
-
-
-@pytest.mark.integration
-@pytest.mark.parametrize("frames", ["on-demand", "stored"])
-def test_a_killed_run_resumes_to_the_same_bits(runs: Path, tmp_path: Path, frames: str) -> None:
-    """Stopped somewhere, then gone on with in the other way; the config says they are one."""
-    shutil.copytree(runs / TOY / "poses-3", tmp_path / TOY / "poses-3")
-    killed = tmp_path / TOY / ENCODER
-    flags = [*COMMON, f"--runs={tmp_path}"]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "experiments.embed", *flags, f"--frames={frames}"],
-        cwd=ROOT,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    while process.poll() is None and not Checkpointer(killed / "checkpoints").steps("latest"):
-        time.sleep(0.005)
-    assert process.poll() is None
-    os.kill(process.pid, signal.SIGKILL)
-    process.wait()
-    assert 0 < Checkpointer(killed / "checkpoints").steps("latest")[-1] < 6
-    other = {"stored": "on-demand", "on-demand": "stored"}[frames]
-    assert "resuming" in run("embed", *flags, f"--frames={other}")
-    assert_same_run(killed, runs / TOY / ENCODER)
-
-
-@pytest.mark.integration
-def test_a_policy_is_trained_on_videos_and_evaluated_in_a_new_process(
-    runs: Path, tmp_path: Path
-) -> None:
-    run("train", *COMMON, f"--runs={runs}", "--workers=1", f"--workdir={tmp_path / 'policy'}")
-    config = read_json(tmp_path / "policy" / "config.json")
+def test_a_policy_that_sees_videos_is_evaluated_in_a_new_process(runs: Path) -> None:
+    policy = runs / TOY / "ours-hvae-video-default-smoke-31"
+    config = read_json(policy / "config.json")
     table = RepresentationTable.load(runs / TOY / ENCODER / "table.npz")
     assert (config["representation"], config["table_hash"]) == ("hvae-video", table.hash)
-    run("evaluate", f"--run={tmp_path / 'policy'}", "--sets=test", "--episodes=5")
-    found = read_json(tmp_path / "policy" / "evaluation" / "test-best-sampled-m4.json")
+    run("evaluate", f"--run={policy}", "--sets=test", "--episodes=5")
+    found = read_json(policy / "evaluation" / "test-best-sampled-m4.json")
     assert found["num_episodes"] == 5
 
 
+class Killed(Exception):
+    """Stands for a signal that no process survives."""
+
+
 @pytest.mark.integration
-def test_the_frozen_encoder_reads_videos_of_new_tools(runs: Path, tmp_path: Path) -> None:
-    """Paper algorithm 2: recordings of tools 1 and 5, which are none of the 24 actions."""
-    frames = record_images(3, [1, 5], 4)[:, :, 2:5, ..., None]
-    np.savez(tmp_path / "new.npz", ids=np.array([101, 105]), recordings=frames)
+@pytest.mark.parametrize("stores_drawn", [False, True])
+def test_both_ways_and_a_resumed_run_give_the_same_bits(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stores_drawn: bool
+) -> None:
+    """Killed while the batch of a later step is gathered, then run again, perhaps the other way."""
+    domain = Domain.of(replace(video_task.TASK, place=PLACE.partition("=")[2]), None)
+    shutil.copytree(runs / TOY / "poses-3", tmp_path / TOY / "poses-3")
+    kind = StoredRecordings if stores_drawn else DrawnRecordings
+    gather, calls = kind.gather, []
+
+    def dying(self: Any, rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        calls.append(rows.shape == (3, 1))
+        if sum(calls) == 3:
+            raise Killed
+        return gather(self, rows, numbers)
+
+    def train(stores: bool) -> Path:
+        found = train_representation(domain, tmp_path, "hvae-video", "smoke", stores_drawn=stores)
+        return found.path
+
+    with monkeypatch.context() as patch:
+        patch.setattr(kind, "gather", dying)
+        with pytest.raises(Killed):
+            train(stores_drawn)
+    folder = tmp_path / TOY / ENCODER
+    assert Checkpointer(folder / "checkpoints").steps("latest")[-1] == 2
+    assert (tmp_path / TOY / "frames-3").exists() == stores_drawn
+    # What was drawn on demand goes on with stored frames; what was stored goes on as it began.
+    assert train(True) == folder
+    assert_same_run(folder, runs / TOY / ENCODER)
+    frames = np.load(tmp_path / TOY / "frames-3" / "recordings.npy")
+    np.testing.assert_array_equal(frames[..., 0], simulated(3))
+
+
+@pytest.mark.integration
+def test_the_frozen_encoder_reads_frames(runs: Path, tmp_path: Path) -> None:
+    """Paper algorithm 2: of the actions themselves, and nothing but frames."""
     encoder = runs / TOY / ENCODER
+    np.savez(tmp_path / "new.npz", ids=np.arange(24), recordings=simulated(3)[..., None])
     output = run(
         "embed",
         f"--checkpoint={encoder}",
         f"--observations={tmp_path / 'new.npz'}",
         f"--output={tmp_path / 'new_table.npz'}",
     )
-    assert "2 actions, 4 numbers each" in output
+    assert "24 actions, 4 numbers each" in output
     new = RepresentationTable.load(tmp_path / "new_table.npz")
-    assert new.ids.tolist() == [101, 105]
     own = RepresentationTable.load(encoder / "table.npz")
-    np.savez(
-        tmp_path / "same.npz",
-        ids=np.arange(24),
-        recordings=record_images(REPRESENTATION_SEED, video_task.TOOL_OF, 3)[:, :, 2:5, ..., None],
-    )
-    run(
-        "embed",
-        f"--checkpoint={encoder}",
-        f"--observations={tmp_path / 'same.npz'}",
-        f"--output={tmp_path / 'same_table.npz'}",
-    )
-    same = RepresentationTable.load(tmp_path / "same_table.npz")
-    np.testing.assert_allclose(same.vectors, own.vectors, atol=1e-6)
-    np.savez(tmp_path / "poses.npz", ids=np.array([1]), recordings=np.zeros((1, 2, 3, 4, 3)))
-    output = run(
-        "embed",
-        f"--checkpoint={encoder}",
-        f"--observations={tmp_path / 'poses.npz'}",
-        f"--output={tmp_path / 'none.npz'}",
-        fails=True,
-    )
-    assert "has shape (1, 2, 3, 4, 3), expected (1, 2, 3, 48, 48, 1)" in output
+    np.testing.assert_allclose(new.vectors, own.vectors, atol=1e-6)
+    np.savez(tmp_path / "poses.npz", ids=np.array([1]), recordings=np.zeros((1, 2, 2, 4, 3)))
+    with pytest.raises(observations.ObservationsError, match=r"expected \(1, 2, 2, 48, 48, 1\)"):
+        observations.load_npz(tmp_path / "poses.npz", video_task.VIDEO.seen)
+
+
+def simulated(num_recordings: int) -> np.ndarray:
+    """u8[24, S, 2, 48, 48] frames drawn while the world is simulated."""
+    frames = record_images(REPRESENTATION_SEED, video_task.TOOL_OF, num_recordings)
+    return frames[:, :, SEEN]
 
 
 @pytest.mark.unit
@@ -149,15 +142,15 @@ def test_recordings_of_both_kinds_are_those_of_the_simulations(tmp_path: Path) -
         stores: collect(tmp_path, video_task.VIDEO, domain.universe, 2, 9, stores)
         for stores in (False, True)
     }
-    expected = record_images(9, video_task.TOOL_OF, 2)[:, :, 2:5, ..., None]
+    expected = record_images(9, video_task.TOOL_OF, 2)[:, :, SEEN, ..., None]
     ids, numbers = np.array([5, 20, 11]), np.array([[1], [0], [1]])
     for recordings in made.values():
         source: Any = recordings.for_training(ids)
-        assert source.shape == (3, 2, 3, 48, 48, 1)
+        assert source.shape == (3, 2, 2, 48, 48, 1)
         found = source.gather(np.arange(3)[:, None], numbers)
         np.testing.assert_array_equal(found, expected[ids[:, None], numbers])
         first: Any = recordings.for_encoding(ids, 1)
-        assert first.shape == (3, 1, 3, 48, 48, 1)
+        assert first.shape == (3, 1, 2, 48, 48, 1)
         np.testing.assert_array_equal(first.gather(np.array([2]), np.array([0])), expected[[11], 0])
         whole: Any = recordings.for_encoding()
         assert whole.shape == expected.shape
