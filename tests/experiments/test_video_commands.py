@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs_host.create.play import record_images
+from envs_host.create.play import PlayConfig, record_images
+from envs_host.create.recorder import Recorder
 from experiments._artifacts import (
     REPRESENTATION_SEED,
     Domain,
@@ -201,6 +202,15 @@ def test_every_create_task_has_videos(name: str) -> None:
         assert name == "create-analysis" or (
             sum(kind.estimate_bytes(2366, laptop) for kind in kinds) < 1e9
         )
+    spacing, last = (3, 10876) if name == "create-analysis" else (15, 2365)
+    assert domain.universe.num_actions == last + 1
+    recorder: Any = play.record_block
+    made = Recorder(5, 1, **recorder._settings).step(last - 1, np.zeros(0)).observation
+    poses = made.view(np.float64).reshape(1, 7, 4, 3)
+    assert play.drawing is not None
+    frames = play.drawing.draw(np.array([last - 1]), poses)
+    expected = record_images(5, [last - 1], 1, PlayConfig(angle_spacing=spacing))
+    np.testing.assert_array_equal(frames[..., 0], expected[0])
     assert parse_representation(domain, "hvae").play is domain.task.play
     assert domain.stage_one(domain.play, "smoke").num_recordings == 4
     with pytest.raises(UsageError, match="hvae-position, hvae-video, vae-state"):
