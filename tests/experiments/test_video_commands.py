@@ -22,7 +22,7 @@ from experiments._flags import UsageError, load_task
 from experiments._recordings import collect
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
-from jaxnew.representation.sources import DrawnRecordings
+from jaxnew.representation.sources import DrawnRecordings, StoredRecordings
 from jaxnew.representation.table import RepresentationTable
 from tests import video_task
 from tests.experiments.commands import read_json, run
@@ -76,30 +76,35 @@ class Killed(Exception):
 
 
 @pytest.mark.integration
-def test_a_killed_run_goes_on_with_stored_frames_to_the_same_bits(
-    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("stores_drawn", [False, True])
+def test_both_ways_and_a_resumed_run_give_the_same_bits(
+    runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stores_drawn: bool
 ) -> None:
-    """Killed while the frames of a step are drawn; compared with a run that drew them all."""
+    """Killed while the batch of a later step is gathered, then run again, perhaps the other way."""
     domain = Domain.of(replace(video_task.TASK, place=PLACE.partition("=")[2]), None)
     shutil.copytree(runs / TOY / "poses-3", tmp_path / TOY / "poses-3")
-    gather, calls = DrawnRecordings.gather, []
+    kind = StoredRecordings if stores_drawn else DrawnRecordings
+    gather, calls = kind.gather, []
 
     def dying(self: Any, rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
-        calls.append(rows.shape)
-        if len(calls) == 3:
+        calls.append(rows.shape == (3, 1))
+        if sum(calls) == 3:
             raise Killed
         return gather(self, rows, numbers)
 
+    def train(stores: bool) -> Path:
+        found = train_representation(domain, tmp_path, "hvae-video", "smoke", stores_drawn=stores)
+        return found.path
+
     with monkeypatch.context() as patch:
-        patch.setattr(DrawnRecordings, "gather", dying)
+        patch.setattr(kind, "gather", dying)
         with pytest.raises(Killed):
-            train_representation(domain, tmp_path, "hvae-video", "smoke")
+            train(stores_drawn)
     folder = tmp_path / TOY / ENCODER
-    assert calls == [(3, 1)] * 3
     assert Checkpointer(folder / "checkpoints").steps("latest")[-1] == 2
-    assert not (tmp_path / TOY / "frames-3").exists()
-    run = train_representation(domain, tmp_path, "hvae-video", "smoke", stores_drawn=True)
-    assert run.path == folder
+    assert (tmp_path / TOY / "frames-3").exists() == stores_drawn
+    # What was drawn on demand goes on with stored frames; what was stored goes on as it began.
+    assert train(True) == folder
     assert_same_run(folder, runs / TOY / ENCODER)
     frames = np.load(tmp_path / TOY / "frames-3" / "recordings.npy")
     np.testing.assert_array_equal(frames[..., 0], simulated(3))
