@@ -5,18 +5,17 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from experiments._flags import UsageError, budget_of
+from experiments._recordings import Recordings, collect
 from jaxnew import config as config_lib
-from jaxnew import loop, observations
+from jaxnew import loop
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.checkpoint import Checkpointer
-from jaxnew.observations import ActionObservations
 from jaxnew.representation import report
 from jaxnew.representation.learner import (
     Modality,
@@ -24,6 +23,7 @@ from jaxnew.representation.learner import (
     RepresentationLearner,
     RepresentationState,
 )
+from jaxnew.representation.sources import RecordingSource
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.run_directory import RunDirectory
 from jaxnew.task import Play, StageOneBudget, Task
@@ -60,7 +60,7 @@ class Domain:
 
     @property
     def play(self) -> Play:
-        """The play environment.
+        """The default play environment.
 
         Raises:
           UsageError: the task has none; its representations are given.
@@ -68,6 +68,16 @@ class Domain:
         if self.task.play is None:
             raise UsageError(f"Task {self.task.name} has no play environment to record actions in.")
         return self.task.play
+
+    def stage_one(self, play: Play, budget_name: str) -> StageOneBudget:
+        """What a budget spends on representations of a play's recordings.
+
+        Raises:
+          UsageError: there is no such budget.
+        """
+        presets = play.stage_one or self.task.stage_one
+        budget: StageOneBudget = budget_of(presets, budget_name, "Stage one")
+        return budget
 
 
 @dataclass(frozen=True)
@@ -84,8 +94,16 @@ class EmbedConfig:
     model: RepresentationConfig
 
 
-def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
-    """Kind and modality of a learned representation's name, such as `hvae` or `vae-onehot`.
+class Learned(NamedTuple):
+    """What the name of a learned representation says: `hvae` or `vae`, of what, and how read."""
+
+    kind: str
+    play: Play
+    modality: Modality
+
+
+def parse_representation(domain: Domain, name: str) -> Learned:
+    """What a learned representation's name, such as `hvae` or `vae-onehot`, says.
 
     The suffix `-oracle` says that the encoder is trained on all actions, test ones included.
 
@@ -93,29 +111,39 @@ def parse_representation(domain: Domain, name: str) -> tuple[str, Modality]:
       UsageError: the name is not of that form.
     """
     kind, _, modality_name = name.removesuffix(_ORACLE).partition("-")
-    modalities = domain.play.modalities
-    modality_name = modality_name or next(iter(modalities))
-    if kind not in ("hvae", "vae") or modality_name not in modalities:
-        legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in modalities]
+    modality_name = modality_name or next(iter(domain.play.modalities))
+    of_play = {name: play for play in domain.task.plays for name in play.modalities}
+    if kind not in ("hvae", "vae") or modality_name not in of_play:
+        legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in of_play]
         raise UsageError(
             f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}, each also "
             f"with {_ORACLE}; engineered: {', '.join(domain.universe.engineered)}; random-SIZE; or "
             "an embed run, or an .npz file."
         )
-    return kind, modalities[modality_name]
+    play = of_play[modality_name]
+    return Learned(kind, play, play.modalities[modality_name])
 
 
-def collect_observations(domain: Domain, runs: Path, num_recordings: int) -> ActionObservations:
-    """The recordings of every action of the domain, made now if they are not there."""
-    return observations.collect(
-        domain.actions_folder(runs) / f"recordings-{num_recordings}",
-        domain.play.record_block,
-        format=domain.play.format,
-        universe=domain.universe,
-        ids=np.arange(domain.universe.num_actions, dtype=np.int32),
-        num_recordings=num_recordings,
-        seed=REPRESENTATION_SEED,
-        block_actions=domain.play.block_actions,
+def collect_observations(
+    domain: Domain,
+    runs: Path,
+    num_recordings: int,
+    play: Play | None = None,
+    stores_drawn: bool = False,
+) -> Recordings:
+    """The recordings of every action of the domain, made now if they are not there.
+
+    Args:
+      play: which ones; default: the task's first.
+      stores_drawn: see `StageOneBudget`.
+    """
+    return collect(
+        domain.actions_folder(runs),
+        play or domain.play,
+        domain.universe,
+        num_recordings,
+        REPRESENTATION_SEED,
+        stores_drawn,
     )
 
 
@@ -129,17 +157,27 @@ def train_representation(
     assignments: list[str] | None = None,
     workdir: Path | None = None,
     overwrite: bool = False,
-    command_line: dict[str, Any] | None = None,
+    num_recordings: int | None = None,
+    stores_drawn: bool | None = None,
 ) -> RunDirectory:
     """Trains (or resumes, or finds complete) an encoder; its table covers every action.
+
+    Args:
+      num_recordings, stores_drawn: instead of the budget's.
 
     Returns:
       The run directory, closed, with `table.npz` and `split.json` in it; without the table if the
       run was interrupted.
     """
-    kind, modality = parse_representation(domain, name)
-    budget: StageOneBudget = budget_of(domain.task.stage_one, budget_name, "Stage one")
-    recordings = collect_observations(domain, runs, budget.num_recordings)
+    kind, play, modality = parse_representation(domain, name)
+    budget = domain.stage_one(play, budget_name)
+    recordings = collect_observations(
+        domain,
+        runs,
+        num_recordings or budget.num_recordings,
+        play,
+        budget.stores_drawn if stores_drawn is None else stores_drawn,
+    )
     config = config_lib.set_paths(
         EmbedConfig(
             task=domain.task.actions_name or domain.task.reference,
@@ -160,8 +198,7 @@ def train_representation(
     ) as run:
         learner = RepresentationLearner(config.model, modality)
         trained = np.union1d(domain.split.ids(config.train_on), domain.split.always_available)
-        rows = recordings.rows(trained)
-        data = jnp.asarray(recordings.data[rows])
+        data = recordings.for_training(trained)
         if not (path / TABLE_FILE).exists():
             print(f"Training {name} ({config.model.num_steps} steps; {budget.cost}) in {path}.")
         result = loop.run(
@@ -180,7 +217,7 @@ def train_representation(
         if not result.was_interrupted and not (path / TABLE_FILE).exists():
             domain.split.save(path / SPLIT_FILE)
             table = RepresentationTable(
-                vectors=learner.encode(result.state, recordings.data),
+                vectors=learner.encode(result.state, recordings.for_encoding()),
                 ids=recordings.ids,
                 universe_hash=domain.universe.hash,
                 split_hash=domain.split.hash,
@@ -192,7 +229,10 @@ def train_representation(
 
 
 def _train_chunk(
-    learner: RepresentationLearner, data: jax.Array, state: RepresentationState, n: int
+    learner: RepresentationLearner,
+    data: jax.Array | RecordingSource,
+    state: RepresentationState,
+    n: int,
 ) -> Any:
     state, metrics = learner.train_steps(state, data, n)
     metrics["nonfinite/loss_and_gradient"] = metrics.pop("nonfinite")
@@ -200,7 +240,7 @@ def _train_chunk(
 
 
 def load_encoder(path: Path) -> tuple[EmbedConfig, RepresentationLearner, RepresentationState, Any]:
-    """The frozen encoder of a stage-one run: (config, learner, state, its task's play format).
+    """The frozen encoder of a stage-one run: (config, learner, state, format of what it reads).
 
     Raises:
       RunDirectoryError, CheckpointError: `path` is no such run, or has no readable checkpoint.
@@ -210,16 +250,16 @@ def load_encoder(path: Path) -> tuple[EmbedConfig, RepresentationLearner, Repres
     run = RunDirectory.load(path)
     config = config_lib.from_dict(EmbedConfig, run.config)
     domain = Domain.of(load_task(config.task), config.split)
-    _, modality = parse_representation(domain, config.representation)
+    _, play, modality = parse_representation(domain, config.representation)
     learner = RepresentationLearner(config.model, modality)
     shape = (
         config.model.actions_per_batch * 8,
         config.model.recordings_per_action,
-        *domain.play.format.shape,
+        *play.seen.shape,
     )
     example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
     state, _ = Checkpointer(run.checkpoints).restore("latest", example)
-    return config, learner, state, domain.play.format
+    return config, learner, state, play.seen
 
 
 def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> RepresentationTable:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
+from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain, parse_representation
 from experiments._flags import UsageError, budget_of
 from experiments._methods import adapted, file_name
 from experiments._runs import Run, read_runs
@@ -199,7 +199,7 @@ def embed_job(source: Source, representation: str) -> Job | None:
         return None
     if (source.embed_folder(representation) / TABLE_FILE).exists():
         return None
-    budget = budget_of(domain.task.stage_one, source.stage_one, "Stage one")
+    budget = domain.stage_one(parse_representation(domain, representation).play, source.stage_one)
     command = (
         "embed",
         f"--task={domain.task.reference}",

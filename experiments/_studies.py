@@ -16,7 +16,12 @@ from matplotlib.figure import Figure
 
 from experiments import _flags as flag
 from experiments import _plots as plots
-from experiments._artifacts import Domain, collect_observations, load_encoder
+from experiments._artifacts import (
+    Domain,
+    collect_observations,
+    load_encoder,
+    parse_representation,
+)
 from experiments._evaluation import evaluate_on, record
 from experiments._methods import file_name
 from experiments._paper import paper_value
@@ -285,8 +290,9 @@ def encoded_test_actions(encoder: Path, split: ActionSplit, num_recordings: int)
     domain = Domain.of(flag.load_task(config.task), config.split)
     if config.split_hash != split.hash:
         raise flag.UsageError(f"{encoder} was trained with another split than the policy.")
+    play = parse_representation(domain, config.representation).play
     folders = sorted(
-        encoder.parent.glob("recordings-*"), key=lambda p: int(p.name.rpartition("-")[2])
+        encoder.parent.glob(f"{play.folder}-*"), key=lambda p: int(p.name.rpartition("-")[2])
     )
     if not folders:
         raise flag.UsageError(
@@ -297,9 +303,8 @@ def encoded_test_actions(encoder: Path, split: ActionSplit, num_recordings: int)
         raise flag.UsageError(
             f"{num_recordings} recordings per action were asked for; {folders[-1]} has {available}."
         )
-    recordings = collect_observations(domain, encoder.parent.parent, available)
-    rows = recordings.rows(split.test)
-    return learner.encode(state, np.asarray(recordings.data[rows][:, :num_recordings]))
+    recordings = collect_observations(domain, encoder.parent.parent, available, play)
+    return learner.encode(state, recordings.for_encoding(split.test, num_recordings))
 
 
 # ---- Search grids ----

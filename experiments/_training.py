@@ -99,6 +99,8 @@ class Trainer:
       machinery: what trains, inside jit or with environments on the host.
       learner: its learner.
       pools: actions that evaluations draw sets from, by split.
+      watched_pools: the same for the evaluations during training; those of the validation actions
+        in the groups of `Task.validation_groups`.
       training_pool: actions that training draws sets from, or the fixed set.
       evaluator: an `Evaluator` or `HostEvaluator` with sets as large as in training, for the
         evaluation after it.
@@ -113,6 +115,7 @@ class Trainer:
     watcher: Any
     table: jax.Array
     pools: dict[str, ActionPool]
+    watched_pools: dict[str, ActionPool]
     training_pool: ActionPool
 
     @classmethod
@@ -146,6 +149,16 @@ class Trainer:
             )
             for name in ("train", "validation", "test")
         }
+        watched_pools = {name: pools[name] for name in SPLITS_WATCHED}
+        if config.split in task.validation_groups:
+            labels = task.validation_groups[config.split](task.make_universe())
+            ids = split.ids("validation")
+            watched_pools["validation"] = ActionPool.of(
+                ids,
+                capacity=len(vectors),
+                always_available=split.always_available,
+                groups=np.asarray(labels)[ids],
+            )
         training_pool = pools["train"]
         if config.num_clusters:
             ids = split.ids(config.trained_on)
@@ -164,8 +177,8 @@ class Trainer:
         check_set_size(pools["train"], rollout_config.set_size, "the train actions")
         if not rollout_config.has_fixed_set:
             check_set_size(training_pool, rollout_config.set_size, "the train actions")
-        for name in SPLITS_WATCHED:
-            check_set_size(pools[name], watched_size, f"the {name} actions")
+        for name, pool in watched_pools.items():
+            check_set_size(pool, watched_size, f"the {name} actions")
         machinery = machinery_of(task, method, config.ppo, config.seed, num_workers)
         return cls(
             config,
@@ -176,6 +189,7 @@ class Trainer:
             replace(machinery.evaluator, set_size=watched_size, padded_set_size=0),
             jnp.asarray(vectors),
             pools,
+            watched_pools,
             training_pool,
         )
 
@@ -199,7 +213,7 @@ class Trainer:
         """Mean episode metrics on train and validation sets, from fixed keys."""
         results: dict[str, float] = {}
         for name in SPLITS_WATCHED:
-            evaluator, pool = self.on_split(name, self.watcher)
+            evaluator, pool = self.watched(name)
             episodes = evaluator.run(
                 state.params,
                 state.rollout.observation_statistics,
@@ -216,6 +230,11 @@ class Trainer:
         if name == self.config.trained_on and self.config.ppo.rollout.has_fixed_set:
             return self._fixed_evaluator, self.training_pool
         return evaluator, self.pools[name]
+
+    def watched(self, name: str) -> tuple[Any, ActionPool]:
+        """What evaluates a part of the split during training."""
+        evaluator, pool = self.on_split(name, self.watcher)
+        return evaluator, self.watched_pools[name] if pool is self.pools[name] else pool
 
     @cached_property
     def _fixed_evaluator(self) -> Any:

@@ -22,6 +22,7 @@ from experiments._artifacts import (
     print_report,
     train_representation,
 )
+from experiments._stage_one_flags import NUM_RECORDINGS, stores_drawn
 from jaxnew import observations
 from jaxnew.representation.table import RepresentationTable
 
@@ -54,6 +55,8 @@ def train() -> None:
         assignments=flag.SET.value,
         workdir=Path(flag.WORKDIR.value) if flag.WORKDIR.value else None,
         overwrite=flag.OVERWRITE.value,
+        num_recordings=NUM_RECORDINGS.value,
+        stores_drawn=stores_drawn(),
     )
     if (run.path / TABLE_FILE).exists():
         table = RepresentationTable.load(run.path / TABLE_FILE)

@@ -175,7 +175,7 @@ class Sweep:
         def of_member(state: TrainState) -> dict[str, jax.Array]:
             results: dict[str, jax.Array] = {}
             for name in SPLITS_WATCHED:
-                evaluator, pool = self.trainer.on_split(name, self.trainer.watcher)
+                evaluator, pool = self.trainer.watched(name)
 
                 def block(
                     start: jax.Array, evaluator: Evaluator = evaluator, pool: ActionPool = pool

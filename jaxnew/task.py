@@ -16,7 +16,24 @@ from jaxnew.environment import ActionSpec, Environment, ObservationSpec
 from jaxnew.observations import RecordBlock, RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
+from jaxnew.representation.sources import DrawRecordings
 from jaxnew.rollout.pool import HostEnvironments, HostPool
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """How recordings that are kept in a small form become what encoders read, such as frames.
+
+    Attributes:
+      format: shape, dtype and bounds of one drawn recording.
+      draw: `(ids int[n], recordings [n, *play's format.shape]) -> [n, *format.shape]`, each by
+        itself. NumPy only: it runs while the device computes.
+      folder: of drawn recordings that are stored.
+    """
+
+    format: RecordingFormat
+    draw: DrawRecordings
+    folder: str
 
 
 @dataclass(frozen=True)
@@ -27,13 +44,25 @@ class Play:
       format: shape, dtype and bounds of one recording.
       record_block: `(seed, ids int32[n], S) -> [n, S, *format.shape]`; see `observations.collect`.
       block_actions: actions recorded per call.
-      modalities: how recordings become network inputs, by name; the first is the default.
+      modalities: how recordings (drawn ones, if there is a drawing) become network inputs, by name;
+        the first is the default.
+      drawing: see `Drawing`; None: encoders read the recordings themselves.
+      folder: of the recordings; another for each play of a task.
+      stage_one: presets by budget for its modalities; without any, those of the task.
     """
 
     format: RecordingFormat
     record_block: RecordBlock
     block_actions: int
     modalities: Mapping[str, Modality]
+    drawing: Drawing | None = None
+    folder: str = "recordings"
+    stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
+
+    @property
+    def seen(self) -> RecordingFormat:
+        """What encoders read."""
+        return self.format if self.drawing is None else self.drawing.format
 
 
 @dataclass(frozen=True)
@@ -46,6 +75,8 @@ class StageOneBudget:
       chunk_steps: gradient steps per compiled call.
       checkpoint_every: gradient steps between checkpoints.
       cost: what it takes; shown before it starts.
+      stores_drawn: recordings of a play with a drawing are drawn once and stored; else they are
+        drawn for each batch. The numbers are the same.
     """
 
     num_recordings: int
@@ -53,6 +84,7 @@ class StageOneBudget:
     chunk_steps: int
     checkpoint_every: int
     cost: str
+    stores_drawn: bool = False
 
 
 @dataclass(frozen=True)
@@ -226,10 +258,14 @@ class Task:
       splits: named ways to split the universe, each from a seed; the first is the default.
       split_seed: seed of the splits; one for the project, so that all runs share them.
       play: recordings of actions, or None for a domain whose representations are given.
+      more_plays: recordings of other kinds of the same actions; their modalities have other names.
       stage_one, stage_two: presets by budget.
       make_environment: the environment where it runs inside jit, made when first needed; else
       host: the environments on the host.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
+      validation_groups: by split, `universe -> label int[A] of every action`: while training,
+        the validation sets of such a split are drawn from half of the groups (spec method 2.2).
+        Evaluations after training, and splits that are not named, know no groups.
       baselines: settings of the paper's baselines.
       measured: speeds, or None where nobody measured them.
       paper_environment: name of the domain in the paper's results, or None.
@@ -242,7 +278,8 @@ class Task:
         `experiments/tasks`; filled in by whoever loads it.
 
     Raises:
-      ValueError: there is not exactly one of `make_environment` and `host`.
+      ValueError: there is not exactly one of `make_environment` and `host`; two plays share a
+        folder or the name of a modality; or groups are for a split that does not exist.
     """
 
     name: str
@@ -252,9 +289,13 @@ class Task:
     make_environment: Callable[[], Environment] = _no_environment
     host: HostDomain | None = None
     play: Play | None = None
+    more_plays: tuple[Play, ...] = ()
     stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
     split_seed: int = 0
     selection_metric: str = "is_success"
+    validation_groups: Mapping[str, Callable[[ActionUniverse], np.ndarray]] = field(
+        default_factory=dict
+    )
     baselines: Baselines = field(default_factory=Baselines)
     measured: Measured | None = None
     paper_environment: str | None = None
@@ -266,6 +307,25 @@ class Task:
     def __post_init__(self) -> None:
         if (self.host is None) == (self.make_environment is _no_environment):
             raise ValueError(f"Task {self.name} needs one of make_environment and host.")
+        names = [name for play in self.plays for name in play.modalities]
+        folders = [play.folder for play in self.plays]
+        folders += [play.drawing.folder for play in self.plays if play.drawing is not None]
+        for what, found in (("modalities", names), ("folders of recordings", folders)):
+            if len(set(found)) < len(found):
+                raise ValueError(
+                    f"Task {self.name}: the {what} {found} must be distinct; rename one."
+                )
+        unknown = sorted(set(self.validation_groups) - set(self.splits))
+        if unknown:
+            raise ValueError(
+                f"Task {self.name} has validation_groups for {unknown}; its splits are "
+                f"{sorted(self.splits)}."
+            )
+
+    @property
+    def plays(self) -> tuple[Play, ...]:
+        """All kinds of recordings, the default first; none if representations are given."""
+        return () if self.play is None else (self.play, *self.more_plays)
 
     @property
     def action_spec(self) -> ActionSpec:

@@ -116,6 +116,8 @@ def record_images(
 ) -> np.ndarray:
     """Video recordings of tools: the trajectories of `record_block` with the same arguments, seen.
 
+    All frames in memory; `envs_host.create.poses` keeps what they are drawn from instead.
+
     Returns:
       u8[n, S, 7, 48, 48] gray frames: tool and ball on white, lines at least one pixel wide (A13).
 

@@ -3,16 +3,31 @@
 from __future__ import annotations
 
 import atexit
+import math
 import os
-from typing import Any
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from envs_host.create.play import NUM_STATES, STATE_SIZE, PlayConfig, record_block
+from envs_host.create.poses import POSES_SHAPE, record_poses
 from envs_host.pool import HostPool
 from envs_host.protocol import Step
 
-MODALITIES = ("state",)
+
+class _Kind(NamedTuple):
+    """What is recorded: how, and shape and dtype of one recording."""
+
+    record: Callable[..., np.ndarray]
+    shape: tuple[int, ...]
+    dtype: type[np.generic]
+
+
+MODALITIES = {
+    "state": _Kind(record_block, (NUM_STATES, STATE_SIZE), np.float32),
+    "poses": _Kind(record_poses, POSES_SHAPE, np.float64),
+}
 
 
 class Recorder:
@@ -21,20 +36,27 @@ class Recorder:
     Args:
       seed: of the recordings.
       num_recordings: S of each tool.
-      modality: `state` f32[S, 7, 6].
+      modality: `state` f32[S, 7, 6], or `poses` f64[S, 7, 4, 3] (see `record_poses`), which pools
+        carry as their bytes u8[S, 672].
       angle_spacing: degrees; which list of tools ids belong to.
+
+    Raises:
+      ValueError: there is no such modality.
     """
 
     position_dim = 0
     episode_metrics: tuple[str, ...] = ()
-    observation_dtype = np.float32
 
     def __init__(
         self, seed: int, num_recordings: int, modality: str = "state", angle_spacing: int = 15
     ) -> None:
-        if modality not in MODALITIES:
-            raise ValueError(f"modality={modality!r} must be one of {MODALITIES}.")
-        self.observation_shape = (num_recordings, NUM_STATES, STATE_SIZE)
+        kind = _kind_of(modality)
+        self.observation_shape: tuple[int, ...] = (num_recordings, *kind.shape)
+        self.observation_dtype: type[np.generic] = kind.dtype
+        if kind.dtype == np.float64:
+            size = math.prod(kind.shape) * np.dtype(kind.dtype).itemsize
+            self.observation_shape, self.observation_dtype = (num_recordings, size), np.uint8
+        self._record = kind.record
         self._seed = seed
         self._config = PlayConfig(angle_spacing=angle_spacing)
 
@@ -46,29 +68,36 @@ class Recorder:
     def step(self, action_id: int, position: np.ndarray) -> Step:
         """Records tool `action_id`."""
         del position
-        block = record_block(self._seed, [action_id], self.observation_shape[0], self._config)
-        return Step(block[0], 0.0, False, False, {})
+        num_recordings = self.observation_shape[0]
+        block = self._record(self._seed, [action_id], num_recordings, self._config)[0]
+        seen = block.view(self.observation_dtype).reshape(self.observation_shape)
+        return Step(seen, 0.0, False, False, {})
 
 
 class PoolRecorder:
-    """`record_block` with worker processes, which are kept from one block to the next.
+    """`record_block` or `record_poses` with worker processes, kept from one block to the next.
 
-    The recordings are those of `play.record_block`, whatever the number of workers.
+    The recordings are those of the function itself, whatever the number of workers.
 
     Args:
       num_workers: processes; 0: as many as there are cores for this one.
-      settings: further arguments of `Recorder`.
+      modality: see `Recorder`.
+      settings: its further arguments.
+
+    Raises:
+      ValueError: there is no such modality.
     """
 
-    def __init__(self, num_workers: int = 0, **settings: Any) -> None:
+    def __init__(self, num_workers: int = 0, modality: str = "state", **settings: Any) -> None:
         self._num_workers = num_workers
-        self._settings = settings
+        self._kind = _kind_of(modality)
+        self._settings = {"modality": modality, **settings}
         self._made_for: tuple[int, int] | None = None
         self._pool: HostPool | None = None
         atexit.register(self.close)
 
     def __call__(self, seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
-        """[n, S, ...] recordings of `ids`; see `play.record_block`."""
+        """[n, S, ...] recordings of `ids`; see `play.record_block` and `poses.record_poses`."""
         pool = self._pool_for(seed, num_recordings)
         blocks = []
         for first in range(0, len(ids), pool.num_envs):
@@ -76,7 +105,8 @@ class PoolRecorder:
             padding = np.full(pool.num_envs - len(some), some[0], np.int32)
             step = pool.step(np.concatenate([some, padding]))
             blocks.append(step.observations[: len(some)].copy())
-        return np.concatenate(blocks)
+        recorded = np.concatenate(blocks).view(self._kind.dtype)
+        return recorded.reshape(len(ids), num_recordings, *self._kind.shape)
 
     def close(self) -> None:
         """Ends the workers."""
@@ -100,3 +130,9 @@ class PoolRecorder:
             self._pool.reset()
             self._made_for = (seed, num_recordings)
         return self._pool
+
+
+def _kind_of(modality: str) -> _Kind:
+    if modality not in MODALITIES:
+        raise ValueError(f"modality={modality!r} must be one of {tuple(MODALITIES)}.")
+    return MODALITIES[modality]

@@ -1,18 +1,24 @@
 """CREATE's recordings as network inputs, and the HVAEs for them (spec method 3, columns CREATE).
 
-A recording is stored as f32[7, 6] states (tool x, y; ball x, y; ball velocity, all in the affine
-map of positions) or as uint8[7, 48, 48, 1] frames. N_train // B gradient steps are an epoch: with
-1,098 train tools 8 of states, 34 of videos.
+A recording is f32[7, 6] states (tool x, y; ball x, y; ball velocity, all in the affine map of
+positions), or uint8[7, 48, 48, 1] frames, which are drawn from f64[7, 4, 3] poses. N_train // B
+gradient steps are an epoch: with 1,098 train tools 8 of states, 34 of videos.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
+from functools import partial
+
+from envs_host.create.poses import FRAMES_SHAPE, POSES_SHAPE, draw_poses
+from envs_host.create.recorder import PoolRecorder
+from jaxnew.observations import RecordingFormat
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import image_modality, vector_modality
+from jaxnew.task import Drawing, Play, StageOneBudget
 
 STATE = vector_modality("state", 6)
 VIDEO = image_modality("video", (48, 48, 1))
-MODALITIES = {"state": STATE, "video": VIDEO}
 
 STATE_HVAE = RepresentationConfig(
     encoder_width=64,
@@ -34,3 +40,47 @@ VIDEO_HVAE = RepresentationConfig(
     recordings_per_action=45,
     num_steps=170_000,
 )
+
+
+def _video_budget(
+    num_recordings: int, hvae: RepresentationConfig, checkpoint_every: int, cost: str
+) -> StageOneBudget:
+    # Of images the flat VAE has the HVAE's batches (spec method 4).
+    configs = {"hvae": hvae, "vae": replace(hvae, kind="vae")}
+    chunk_steps = min(20, checkpoint_every)
+    return StageOneBudget(num_recordings, configs, chunk_steps, checkpoint_every, cost)
+
+
+_VIDEO_STAGE_ONE = {
+    "smoke": _video_budget(
+        2,
+        replace(VIDEO_HVAE, num_steps=2, recordings_per_action=2, actions_per_batch=2),
+        1,
+        "a minute and a half on one core, half of it for compiling",
+    ),
+    "laptop": _video_budget(
+        24,
+        replace(VIDEO_HVAE, num_steps=2000, recordings_per_action=4, actions_per_batch=16),
+        100,
+        "about 1.2 hours and 3.5 GB of memory on one core, from the rates of 3 steps and 20 tools",
+    ),
+    "paper": _video_budget(1024, VIDEO_HVAE, 500, "nobody measured how long it takes"),
+}
+
+
+def video_play(spacing_deg: int) -> Play:
+    """Videos of the tools `spacing_deg` degrees apart, of the simulations of their states."""
+    kind = f"{spacing_deg} degrees"
+    return Play(
+        format=RecordingFormat(f"CREATE play, poses, {kind}", POSES_SHAPE, "float64"),
+        record_block=PoolRecorder(modality="poses", angle_spacing=spacing_deg),
+        block_actions=64,
+        modalities={"video": VIDEO},
+        drawing=Drawing(
+            format=RecordingFormat(f"CREATE play, video, {kind}", FRAMES_SHAPE, "uint8"),
+            draw=partial(draw_poses, angle_spacing=spacing_deg),
+            folder="frames",
+        ),
+        folder="poses",
+        stage_one=_VIDEO_STAGE_ONE,
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, replace
 from functools import partial
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from envs_host.create.tools.splits import (
     analysis_split,
 )
 from envs_host.pool import HostPool, PoolSettings
-from experiments.tasks._create_stage_one import STATE, STATE_HVAE
+from experiments.tasks._create_stage_one import STATE, STATE_HVAE, video_play
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
 from jaxnew.observations import RecordingFormat
@@ -178,7 +179,9 @@ def _play(spacing_deg: int) -> Play:
     )
 
 
-_PLAY = {spacing: _play(spacing) for spacing in (DEFAULT_SPACING_DEG, ANALYSIS_SPACING_DEG)}
+_SPACINGS = (DEFAULT_SPACING_DEG, ANALYSIS_SPACING_DEG)
+_PLAY = {spacing: _play(spacing) for spacing in _SPACINGS}
+_VIDEO_PLAY = {spacing: video_play(spacing) for spacing in _SPACINGS}
 
 
 def _published(name: str, universe: ActionUniverse, seed: int) -> ActionSplit:
@@ -274,8 +277,11 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             pool_settings=PoolSettings(),
         ),
         play=_PLAY[spacing],
+        more_plays=(_VIDEO_PLAY[spacing],),
         stage_one=_STAGE_ONE,
         stage_two=_STAGE_TWO,
+        # Spec create 8.3: of the Full split alone, and only while training.
+        validation_groups={} if is_analysis else {"full": attrgetter("class_labels")},
         baselines=Baselines(
             continuous_rollout_share=2 / 3, fixed_set_minibatches=6, finetune_share=1 / 6
         ),

@@ -5,18 +5,32 @@ Batches can be recomputed for any step, so a resumed run sees what an uninterrup
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 
 
-def hvae_batch(
+class Choice(NamedTuple):
+    """Recordings of a batch: `recordings[rows, numbers]`.
+
+    Attributes:
+      rows: int32[B, 1] or int32[1, n] actions.
+      numbers: int32[B, S] or int32[1, n] which recordings of theirs.
+    """
+
+    rows: jax.Array
+    numbers: jax.Array
+
+
+def hvae_choice(
     key_epochs: jax.Array,
     key_step: jax.Array,
     step: jax.Array,
-    recordings: jax.Array,
+    shape: tuple[int, ...],
     actions_per_batch: int,
     recordings_per_action: int,
-) -> jax.Array:
+) -> Choice:
     """One HVAE batch: B of A actions, S recordings of each, both without replacement.
 
     An epoch is one shuffled pass over the actions, its last incomplete batch dropped (spec
@@ -26,32 +40,27 @@ def hvae_batch(
       key_epochs: typed key; epoch e is shuffled with `fold_in(key_epochs, e)`.
       key_step: typed key of this step, consumed.
       step: int32[] gradient step, counted from 0.
-      recordings: [A, S_total, T, D0].
+      shape: (A, S_total, ...) of the recordings.
       actions_per_batch: B, at most A.
       recordings_per_action: S, at most S_total.
-    Returns:
-      [B, S, T, D0], stored dtype.
     """
-    num_actions, num_recordings = recordings.shape[:2]
+    num_actions, num_recordings = shape[:2]
     epoch, batch = jnp.divmod(step, num_actions // actions_per_batch)
     order = jax.random.permutation(jax.random.fold_in(key_epochs, epoch), num_actions)
     actions = jax.lax.dynamic_slice_in_dim(order, batch * actions_per_batch, actions_per_batch)
     # The S largest of independent draws are a uniform subset.
     noise = jax.random.uniform(key_step, (actions_per_batch, num_recordings))
     _, chosen = jax.lax.top_k(noise, recordings_per_action)
-    return recordings[actions[:, None], chosen]
+    return Choice(actions[:, None], chosen)
 
 
-def flat_vae_batch(key_step: jax.Array, recordings: jax.Array, num_recordings: int) -> jax.Array:
-    """One flat-VAE batch: recordings of all actions pooled, drawn with replacement (spec method 4).
+def flat_vae_choice(key_step: jax.Array, shape: tuple[int, ...], num_recordings: int) -> Choice:
+    """One flat-VAE batch: recordings of all actions alike, drawn with replacement (spec method 4).
 
     Args:
       key_step: typed key of this step, consumed.
-      recordings: [A, S_total, T, D0].
+      shape: (A, S_total, ...) of the recordings.
       num_recordings: n.
-    Returns:
-      [1, n, T, D0], stored dtype.
     """
-    pool = recordings.reshape(-1, *recordings.shape[2:])
-    chosen = jax.random.randint(key_step, (1, num_recordings), 0, len(pool))
-    return pool[chosen]
+    chosen = jax.random.randint(key_step, (1, num_recordings), 0, shape[0] * shape[1])
+    return Choice(*jnp.divmod(chosen, shape[1]))

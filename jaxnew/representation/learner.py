@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -12,9 +11,9 @@ import numpy as np
 import optax
 from flax import struct
 
-from jaxnew.representation.batches import flat_vae_batch, hvae_batch
+from jaxnew.representation._models import build_model
+from jaxnew.representation.batches import Choice, flat_vae_choice, hvae_choice
 from jaxnew.representation.config import RepresentationConfig
-from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.objective import (
     ElboTerms,
@@ -24,11 +23,16 @@ from jaxnew.representation.objective import (
     reconstruction_weight,
     weighted_loss,
 )
-from jaxnew.representation.vae import FlatVAE
+from jaxnew.representation.sources import RecordingSource, padded_chunks
 
 __all__ = ["Modality", "RepresentationConfig", "RepresentationLearner", "RepresentationState"]
 
 Metrics = dict[str, jax.Array]
+
+# What is encoded at a time: actions, and numbers of their features. 2^24 are 64 MiB; the layers'
+# outputs are several times as much.
+_ENCODED_ACTIONS = 8
+_ENCODED_FEATURES = 2**24
 
 
 @struct.dataclass
@@ -56,18 +60,21 @@ class RepresentationLearner:
     """Trains an HVAE or a flat VAE and encodes actions with it.
 
     Recordings are given in their stored dtype, `[A, S_total, T, D0]`, and become features only
-    after a batch has been drawn.
+    after a batch has been drawn. They are an array, which training keeps on the device, or a
+    `RecordingSource`, which gives each batch when it is needed.
     """
 
     def __init__(self, config: RepresentationConfig, modality: Modality) -> None:
         self.config = config
         self.modality = modality
-        self._model = _build_model(config, modality)
+        self._model = build_model(config, modality)
         # Spec method 3.7: elementwise clamp, then RAdam with betas 0.9 and 0.999, eps 1e-8.
         self._optimizer = optax.chain(
             optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
         )
         self._run = jax.jit(self._run_steps)
+        self._step = jax.jit(self._step_on)
+        self._choices = jax.jit(self._choices_of, static_argnames=("shape", "num_steps"))
         self._posterior = jax.jit(self._posterior_of)
 
     def init(self, key: jax.Array, recordings_shape: tuple[int, ...]) -> RepresentationState:
@@ -97,17 +104,18 @@ class RepresentationLearner:
         )
 
     def train_steps(
-        self, state: RepresentationState, recordings: jax.Array, num_steps: int
+        self, state: RepresentationState, recordings: jax.Array | RecordingSource, num_steps: int
     ) -> tuple[RepresentationState, Metrics]:
         """Takes `num_steps` gradient steps; `2k` at once equal two calls of `k` bit for bit (CPU).
 
-        The number of steps is a traced bound of one compiled loop, so that every value runs the
-        same program.
+        Of an array, the number of steps is a traced bound of one compiled loop, so that every value
+        runs the same program. Of a source, each step is a call, and the host gathers the next batch
+        while it computes; the batches are those of an array with the same recordings.
 
         Args:
           state: not changed.
           recordings: [A_train, S_total, T, D0], stored dtype; kept on the device between calls if
-            it is a `jax.Array`.
+            it is a `jax.Array`. Or a source of that shape.
           num_steps: at least 1.
         Returns:
           The new state, and f32[] metrics: means over the steps of `loss`, `reconstruction`,
@@ -119,16 +127,24 @@ class RepresentationLearner:
         self._check_trainable(recordings.shape)
         if num_steps < 1:
             raise ValueError(f"num_steps={num_steps} must be at least 1.")
+        if isinstance(recordings, RecordingSource):
+            return self._run_on_source(state, recordings, num_steps)
         return self._run(state, jnp.asarray(recordings), jnp.int32(num_steps))
 
     def encode(
-        self, state: RepresentationState, recordings: jax.Array | np.ndarray, batch: int = 8
+        self,
+        state: RepresentationState,
+        recordings: jax.Array | np.ndarray | RecordingSource,
+        batch: int | None = None,
     ) -> np.ndarray:
         """Action representations: the posterior means of `encode_posterior`, f32[A, d]."""
         return self.encode_posterior(state, recordings, batch)[0]
 
     def encode_posterior(
-        self, state: RepresentationState, recordings: jax.Array | np.ndarray, batch: int = 8
+        self,
+        state: RepresentationState,
+        recordings: jax.Array | np.ndarray | RecordingSource,
+        batch: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Posterior of each action given all its recordings, batch norm in inference mode.
 
@@ -137,9 +153,9 @@ class RepresentationLearner:
 
         Args:
           state: trained state; only its parameters and running averages are read.
-          recordings: [A, S, T, D0], stored dtype; may stay on the host.
+          recordings: [A, S, T, D0], stored dtype; may stay on the host, or be a source.
           batch: actions encoded at a time; bounds memory, does not change the result beyond
-            rounding.
+            rounding. Default: 8, or as many as have 2^24 features, but at least one.
         Returns:
           (mean, log-variance), each f32[A, d]. For the flat VAE: the mean over recordings of their
           posterior means, and the log-variance that they all share.
@@ -152,14 +168,19 @@ class RepresentationLearner:
                 f"recordings must be a non-empty {self._recordings_form}, got shape "
                 f"{recordings.shape}."
             )
+        num_actions, num_recordings = recordings.shape[:2]
+        if batch is None:
+            num_steps = self.modality.num_steps(recordings.shape)
+            size = num_recordings * num_steps * self.modality.feature_dim
+            batch = min(_ENCODED_ACTIONS, max(1, _ENCODED_FEATURES // size))
         if batch < 1:
             raise ValueError(f"batch={batch} must be at least 1.")
-        parts = [
-            self._posterior(state.params, state.batch_stats, chunk)
-            for chunk in _padded_chunks(recordings, batch)
-        ]
+        parts: list[Any] = []
+        for chunk in padded_chunks(recordings, batch):
+            parts.append(self._posterior(state.params, state.batch_stats, chunk))
+            # At most one chunk waits while another is encoded, so that memory is bounded.
+            parts[-2:-1] = jax.device_get(parts[-2:-1])
         means, log_variances = zip(*jax.device_get(parts), strict=True)
-        num_actions = len(recordings)
         return np.concatenate(means)[:num_actions], np.concatenate(log_variances)[:num_actions]
 
     def _check_trainable(self, shape: tuple[int, ...]) -> None:
@@ -236,7 +257,47 @@ class RepresentationLearner:
         self, state: RepresentationState, recordings: jax.Array
     ) -> tuple[RepresentationState, Metrics]:
         """One gradient step; metrics of this step."""
-        features, epoch, key_noise = self._draw(state, recordings)
+        return self._descend(state, *self._draw(state, recordings))
+
+    def _run_on_source(
+        self, state: RepresentationState, source: RecordingSource, num_steps: int
+    ) -> tuple[RepresentationState, Metrics]:
+        shape = source.shape
+        rows, numbers = jax.device_get(self._choices(state, shape=shape, num_steps=num_steps))
+        batch = source.gather(rows[0], numbers[0])
+        totals: Metrics = {}
+        for i in range(num_steps):
+            state, metrics = self._step(state, batch, jnp.int32(shape[0]))
+            # One step computes and at most one waits while the next batch is gathered.
+            jax.block_until_ready(totals)
+            totals = jax.tree.map(jnp.add, totals, metrics) if totals else metrics
+            if i + 1 < num_steps:
+                batch = source.gather(rows[i + 1], numbers[i + 1])
+        means = {name: total / num_steps for name, total in totals.items()}
+        return state, {**means, "nonfinite": totals["nonfinite"]}
+
+    def _choices_of(
+        self, state: RepresentationState, shape: tuple[int, ...], num_steps: int
+    ) -> Choice:
+        """What the next `num_steps` steps see, int32[num_steps, ...]."""
+        steps = state.step + jnp.arange(num_steps)
+        return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
+
+    def _step_on(
+        self, state: RepresentationState, batch: jax.Array, num_actions: jax.Array
+    ) -> tuple[RepresentationState, Metrics]:
+        """One gradient step on a batch [B, S, T, D0] of `num_actions` train actions."""
+        epoch = self._epoch(state, num_actions)
+        return self._descend(state, self._features(batch), epoch, self._step_keys(state)[1])
+
+    def _descend(
+        self,
+        state: RepresentationState,
+        features: jax.Array,
+        epoch: jax.Array,
+        key_noise: jax.Array,
+    ) -> tuple[RepresentationState, Metrics]:
+        """One gradient step; its arguments are those that `_draw` returns."""
         weight = reconstruction_weight(epoch)
         gradient_of = jax.value_and_grad(self._loss, has_aux=True)
         (loss, (terms, batch_stats)), grads = gradient_of(
@@ -265,25 +326,36 @@ class RepresentationLearner:
         self, state: RepresentationState, recordings: jax.Array
     ) -> tuple[jax.Array, jax.Array, jax.Array]:
         """This step's (features f32[B, S, T, D], epoch int32[], key of the latents' noise)."""
-        key_step = jax.random.fold_in(state.key_steps, state.step)
-        key_batch, key_noise = jax.random.split(key_step)
+        choice = self._choice(state, recordings.shape)
+        batch = recordings[choice.rows, choice.numbers]
+        epoch = self._epoch(state, recordings.shape[0])
+        return self._features(batch), epoch, self._step_keys(state)[1]
+
+    def _step_keys(self, state: RepresentationState) -> tuple[jax.Array, jax.Array]:
+        """Keys of this step: of its batch, and of the latents' noise."""
+        key_batch, key_noise = jax.random.split(jax.random.fold_in(state.key_steps, state.step))
+        return key_batch, key_noise
+
+    def _epoch(self, state: RepresentationState, num_actions: int | jax.Array) -> jax.Array:
+        """int32[] this step's epoch; of pooled recordings it is one step (spec method 4)."""
+        if self._pools_recordings:
+            return state.step
+        return state.step // (num_actions // self.config.actions_per_batch)
+
+    def _choice(self, state: RepresentationState, shape: tuple[int, ...]) -> Choice:
+        """Which recordings, of [A, S_total, ...], this step sees."""
+        key_batch, _ = self._step_keys(state)
         config = self.config
-        if not self._pools_recordings:
-            epoch = state.step // (recordings.shape[0] // config.actions_per_batch)
-            batch = hvae_batch(
-                state.key_epochs,
-                key_batch,
-                state.step,
-                recordings,
-                config.actions_per_batch,
-                config.recordings_per_action,
-            )
-        else:
-            epoch = state.step  # Spec method 4: an epoch is one step.
-            batch = flat_vae_batch(
-                key_batch, recordings, self._flat_batch_size(recordings.shape[0])
-            )
-        return self._features(batch), epoch, key_noise
+        if self._pools_recordings:
+            return flat_vae_choice(key_batch, shape, self._flat_batch_size(shape[0]))
+        return hvae_choice(
+            state.key_epochs,
+            key_batch,
+            state.step,
+            shape,
+            config.actions_per_batch,
+            config.recordings_per_action,
+        )
 
     def _features(self, recordings: jax.Array) -> jax.Array:
         """f32[..., T, D] of stored recordings [..., T, D0] or of images.
@@ -330,39 +402,3 @@ class RepresentationLearner:
             variables, self._features(recordings), method="posterior"
         )
         return posterior
-
-
-def _build_model(config: RepresentationConfig, modality: Modality) -> HVAE | FlatVAE:
-    if config.kind == "hvae":
-        return HVAE(
-            encoder_width=config.encoder_width,
-            inference_width=config.inference_width,
-            hidden_width=config.hidden_width,
-            action_latent=config.action_latent,
-            observation_latent=config.observation_latent,
-            gaussian_dim=modality.gaussian_dim,
-            image_shape=modality.image_shape,
-            is_still=modality.is_still,
-        )
-    return FlatVAE(
-        encoder_width=config.encoder_width,
-        hidden_width=config.hidden_width,
-        observation_latent=config.observation_latent,
-        gaussian_dim=modality.gaussian_dim,
-        image_shape=modality.image_shape,
-        is_still=modality.is_still,
-    )
-
-
-def _padded_chunks(
-    recordings: jax.Array | np.ndarray, batch: int
-) -> Iterator[jax.Array | np.ndarray]:
-    """Chunks [batch, S, T, D0] of all actions; the last repeats its last action up to `batch`.
-
-    Equal shapes, so that one program encodes them all.
-    """
-    num_actions = len(recordings)
-    batch = min(batch, num_actions)
-    for start in range(0, num_actions, batch):
-        rows = np.minimum(np.arange(start, start + batch), num_actions - 1)
-        yield recordings[rows]

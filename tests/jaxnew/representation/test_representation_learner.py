@@ -66,7 +66,7 @@ def test_hvae_batches_hold_distinct_recordings_and_epochs_distinct_actions():
 
     def draw(step):
         key_step = jax.random.fold_in(key_steps, step)
-        return batches.hvae_batch(key_epochs, key_step, step, recordings, 3, 6)
+        return recordings[batches.hvae_choice(key_epochs, key_step, step, (11, 9), 3, 6)]
 
     drawn = np.asarray(jax.vmap(draw)(jnp.arange(12)))[:, :, :, 0]
     assert drawn.shape == (12, 3, 6, 2)
@@ -84,7 +84,8 @@ def test_every_recording_is_drawn_equally_often():
 
     def draw(step):
         key = jax.random.key(3)
-        return batches.hvae_batch(key, jax.random.fold_in(key, step), step, recordings, 2, 3)
+        key_step = jax.random.fold_in(key, step)
+        return recordings[batches.hvae_choice(key, key_step, step, (2, 8), 2, 3)]
 
     drawn = np.asarray(jax.vmap(draw)(jnp.arange(2000)))[..., 0, 1]
     counts = np.bincount(drawn.ravel(), minlength=8)
@@ -95,7 +96,7 @@ def test_every_recording_is_drawn_equally_often():
 @pytest.mark.property
 def test_flat_vae_batches_pool_all_actions_with_replacement():
     recordings = labelled(4, 5)
-    drawn = np.asarray(batches.flat_vae_batch(jax.random.key(0), recordings, 400))
+    drawn = np.asarray(recordings[batches.flat_vae_choice(jax.random.key(0), (4, 5), 400)])
     assert drawn.shape == (1, 400, 1, 2)
     flat = drawn[0, :, 0, 0] * 5 + drawn[0, :, 0, 1]
     counts = np.bincount(flat, minlength=20)
