@@ -138,8 +138,7 @@ def _note(num_seeds: Sequence[int], steps: float | None) -> str:
     seeds = f"{number} seed{'s' if high > 1 else ''}"
     if steps is None:
         return seeds
-    amount = f"{1e-6 * steps:.3g} M" if steps >= 1e6 else f"{1e-3 * steps:.3g} k"
-    return f"{seeds}\n{amount} steps"
+    return f"{seeds}\n{plots.amount(steps)}"
 
 
 def environment_of(groups: Sequence[Group]) -> str:

@@ -20,6 +20,7 @@ from typing import Any
 from experiments._artifacts import TABLE_FILE
 from experiments._flags import UsageError, budget_of
 from experiments._methods import file_name
+from experiments._plots import amount
 from experiments._production import Cell, Source
 from jaxnew.task import StageTwoBudget
 
@@ -87,7 +88,8 @@ def embed_job(source: Source, representation: str) -> Job | None:
     budget = budget_of(domain.task.stage_one, source.stage_one, "Stage one")
     command = (
         "embed",
-        f"--task={domain.task.reference}",
+        # By the name of its actions, so that tasks which share them have one command.
+        f"--task={domain.task.actions_name or domain.task.reference}",
         f"--split={domain.split_name}",
         f"--representation={representation}",
         f"--budget={source.stage_one}",
@@ -129,7 +131,7 @@ def train_job(source: Source, cell: Cell, seed: int, folder: Path | None = None)
     cost = duration(seconds)
     if seconds is None:
         cost += f"; a whole run of budget {source.budget} takes {budget.cost}"
-    return Job(f"{cell.label}, seed {seed}, {steps * 1e-6:.2f} M", command, cost, seconds)
+    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds)
 
 
 def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
@@ -183,7 +185,7 @@ def sweep_job(
     steps = budget.num_updates * budget.ppo.steps_per_update
     num_runs = len(seeds) * math.prod(values.count(",") + 1 for values in vary)
     seconds = training_seconds(source, cell.method, steps * num_runs, num_runs)
-    title = f"{cell.label}, {num_runs} runs of {steps * 1e-6:.2f} M in one program"
+    title = f"{cell.label}, {num_runs} runs of {amount(steps)} in one program"
     return Job(title, command, duration(seconds), seconds)
 
 

@@ -48,7 +48,8 @@ def define_flags() -> None:
         "given",
         [],
         "NAME=PATH: a table (.npz) or run of embed to take for a representation; NAME@SPLIT=PATH "
-        "where a figure has one of another split than --split (7a, 15: hvae@full).",
+        "or NAME@VARIANT=PATH where a figure has one of another split or of other actions (7a, 15: "
+        "hvae@full; 9a-c: hvae-oracle@analysis).",
     )
     flags.DEFINE_string(
         "representation_budget", None, "Budget of representations to be trained; default: --budget."

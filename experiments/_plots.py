@@ -66,6 +66,11 @@ class Metric:
         return f"{value * self.scale:.1f}" if self.scale == 100.0 else f"{value:.3f}"
 
 
+def amount(steps: float) -> str:
+    """Environment steps for reading."""
+    return f"{1e-6 * steps:.3g} M steps" if steps >= 1e6 else f"{1e-3 * steps:.3g} k steps"
+
+
 @dataclass(frozen=True)
 class Bar:
     """A mean with the ends of its error bar."""

@@ -63,8 +63,9 @@ class Source:
       steps: environment steps of every run; 0 for those of the preset.
       seeds: of the policies.
       assignments: of `--set`.
-      given: tables and runs of `embed` to take for a representation; of another split than that of
-        `domain` under `REPRESENTATION@SPLIT`.
+      given: tables and runs of `embed` to take for a representation; where a cell has other actions
+        or another split than `domain`, those under `REPRESENTATION@VARIANT` or
+        `REPRESENTATION@SPLIT`.
       workers: processes for environments on the host; 0: one per core.
     """
 
@@ -91,8 +92,10 @@ class Source:
         if task is self.domain.task and split == self.domain.split_name:
             return self
         given = self.given
-        if split != self.domain.split_name:
-            end = f"@{split}"
+        words = [cell.variant.strip("-")] * (task.actions_name != self.domain.task.actions_name)
+        words += [split] * (split != self.domain.split_name)
+        if words:
+            end = f"@{'-'.join(words)}"
             given = {k.removesuffix(end): path for k, path in given.items() if k.endswith(end)}
         return replace(self, domain=Domain.of(task, split), given=given)
 
@@ -154,8 +157,7 @@ def find(source: Source, cell: Cell) -> dict[int, Run]:
             raise UsageError(
                 f"{found[seed].path} and {run.path} are both {cell.method} on "
                 f"{cell.representation} with seed {seed}; move one of them away, or name the table "
-                f"that you mean with --given={cell.representation}=TABLE "
-                f"({cell.representation}@SPLIT=TABLE of another split than that of --split)."
+                f"that you mean with --given={cell.representation}=TABLE."
             )
         found[seed] = run
     return found

@@ -129,7 +129,7 @@ def search_parts(name: str, source: Source, cell: Cell, values: Sequence[float])
     by_value = dict(zip(values, grid.sources(source, cell.method, values), strict=True))
     if source.domain.task.host is not None:
         return [
-            Part(train_job(own, cell, seed, place), place)
+            Part(_named(train_job(own, cell, seed, place), grid, value), place)
             for value, own in by_value.items()
             for seed in source.seeds
             for place in [folder / f"{value:g}-{seed}"]
@@ -139,10 +139,14 @@ def search_parts(name: str, source: Source, cell: Cell, values: Sequence[float])
         vary = [f"{grid.traced}={','.join(f'{value:g}' for value in values)}"]
         return [Part(sweep_job(source, cell, source.seeds, place, vary), place)]
     return [
-        Part(sweep_job(own, cell, source.seeds, place), place)
+        Part(_named(sweep_job(own, cell, source.seeds, place), grid, value), place)
         for value, own in by_value.items()
         for place in [folder / f"{value:g}-{seeds}"]
     ]
+
+
+def _named(job: Job, grid: Grid, value: float) -> Job:
+    return replace(job, title=f"{grid.axis} {value:g}: {job.title}")
 
 
 def search(
@@ -150,6 +154,7 @@ def search(
     seeds: Sequence[int],
     steps: float,
     values: Sequence[float],
+    stage_one: str | None = None,
     is_dry: bool = False,
 ) -> Study | None:
     """Trains every value of a grid with every seed; the best by validation is named.
@@ -159,6 +164,7 @@ def search(
       seeds: of the runs.
       steps: environment steps of every run; 0 for those of the preset.
       values: of the grid; none for the paper's.
+      stage_one: budget of a representation that is to be trained; None for that of the runs.
       is_dry: only says what is missing and how long it takes.
 
     Returns:
@@ -172,7 +178,7 @@ def search(
         domain=Domain.of(flag.load_task(flag.TASK.value), flag.SPLIT.value),
         folder=Path(flag.RUNS.value),
         budget=flag.BUDGET.value,
-        stage_one=flag.BUDGET.value,
+        stage_one=stage_one or flag.BUDGET.value,
         steps=steps,
         seeds=tuple(seeds),
         assignments=tuple(flag.SET.value),

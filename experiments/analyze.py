@@ -35,6 +35,9 @@ EPISODES = flags.DEFINE_integer("episodes", 5000, "Episodes of each evaluation."
 SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71", "81"], "Seeds of a search.")
 STEPS = flags.DEFINE_float("steps", 0.0, "Environment steps of a search's runs; 0: of --budget.")
 DRY_RUN = flags.DEFINE_bool("dry_run", False, "Of a search, only say what is missing.")
+REPRESENTATION_BUDGET = flags.DEFINE_string(
+    "representation_budget", None, "Budget of a search's representation; default: --budget."
+)
 OUT = flags.DEFINE_string("out", None, "Where to write; default: `analysis/` beside the runs.")
 
 
@@ -47,6 +50,7 @@ def main() -> None:
             [int(seed) for seed in SEEDS.value],
             STEPS.value,
             [float(value) for value in VALUES.value],
+            REPRESENTATION_BUDGET.value,
             DRY_RUN.value,
         )
         if searched is None:

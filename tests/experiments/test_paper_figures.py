@@ -290,7 +290,8 @@ def test_a_figure_is_made_stopped_and_finished(tmp_path: Path) -> None:
     assert process.returncode != 0, output
     stamp = (first / "metrics.jsonl").stat().st_mtime_ns
 
-    files = [Path(line) for line in commands.run(*flags).splitlines() if "/figures/" in line]
+    place = str(folder / "figures")
+    files = [Path(line) for line in commands.run(*flags).splitlines() if line.startswith(place)]
     assert [file.name for file in files] == ["figure_6.png", "figure_6.md", "figure_6.csv"]
     assert (first / "metrics.jsonl").stat().st_mtime_ns == stamp
     with (folder / "figures" / "figure_6.csv").open() as file:
