@@ -233,10 +233,13 @@ def sheet(stills: Sequence[tuple[int, str, np.ndarray]], title: str = "") -> Fig
     num_rows = -(-len(stills) // _NUM_COLUMNS)
     figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
     every = figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel()
-    for axes in every:
+    for axes in every[len(stills) :]:
         axes.set_axis_off()
     for axes, (number, outcome, picture) in zip(every, stills, strict=False):
         axes.imshow(picture, interpolation="none")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.spines[:].set_color(plots.GRID_COLOR)
         color = _GOOD if outcome == SUCCESS else _BAD
         axes.set_title(f"episode {number}: {outcome}", fontsize=9, color=color)
     share = f"{sum(outcome == SUCCESS for _, outcome, _ in stills)} of {len(stills)} successful"

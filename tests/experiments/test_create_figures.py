@@ -471,6 +471,19 @@ def test_held_out_tools_of_two_splits(tmp_path: Path, monkeypatch: pytest.Monkey
 
 
 @pytest.mark.unit
+def test_the_legend_of_all_classes_is_as_wide_as_the_picture() -> None:
+    names = load_task("create-push").make_universe().class_names
+    labels = np.arange(len(names))
+    points = np.column_stack([labels, labels]).astype(float)
+    figure = _drawing.plots.tsne_scatter([_drawing.Scatter(points, labels)] * 2, names)
+    figure.canvas.draw()
+    (legend,) = figure.legends
+    extent = legend.get_window_extent()
+    assert 0.6 * figure.bbox.width < extent.width < figure.bbox.width
+    assert _drawing.plots.amount(96.0) == "96 steps"
+
+
+@pytest.mark.unit
 def test_a_given_table_is_one_of_the_cells_split(tmp_path: Path) -> None:
     source = source_of("create-push", tmp_path, given={"hvae": tmp_path / "t.npz"})
     assert embed_job(source, "hvae") is None
