@@ -225,7 +225,8 @@ def draw(
     rows = {g.label: [r for r in result_rows(g) if r.is_standard] for g in groups}
     drawn = bars_figure(groups, rows, title)
     files = plots.save(drawn, out / f"{name}.png", values.pdf) if drawn else []
-    return files + write_results(name, title, groups, rows, out)
+    notes = [figure.note] if figure.note else []
+    return files + write_results(name, title, groups, rows, out, notes)
 
 
 def representation_panels(
@@ -296,9 +297,10 @@ def write_results(
     groups: Sequence[Group],
     rows: Mapping[str, Sequence[ResultRow]],
     out: Path,
+    notes: Sequence[str] = (),
 ) -> list[Path]:
     """The numbers of the bars as Markdown and CSV."""
     flat = [row for group in groups for row in rows[group.label]]
-    (out / f"{name}.md").write_text(as_markdown(title, flat, groups[0].metric, []), "utf-8")
+    (out / f"{name}.md").write_text(as_markdown(title, flat, groups[0].metric, notes), "utf-8")
     (out / f"{name}.csv").write_text(as_csv(flat), "utf-8")
     return [out / f"{name}.md", out / f"{name}.csv"]

@@ -297,7 +297,7 @@ def test_bars_are_the_evaluations(
                 write_evaluation(finished(source, cell, seed), split, mean, set_size=5)
     values = SimpleNamespace(episodes=1000, pdf=False)
     figure = FIGURES[number]
-    picture, _, table = _paper_figures.draw(number, figure, settings, tmp_path, values)
+    picture, text, table = _paper_figures.draw(number, figure, settings, tmp_path, values)
     with table.open() as file:
         rows = list(csv.DictReader(file))
     assert list(dict.fromkeys(row["setting"] for row in rows)) == labels
@@ -306,6 +306,7 @@ def test_bars_are_the_evaluations(
     assert [float(row["paper_mean"]) for row in rows] == pytest.approx(papers, abs=1e-3)
     assert {row["num_seeds"] for row in rows} == {"2"}
     assert Image.open(picture).size[0] > 800
+    assert (number == "7a") == ("the target is uncertain" in text.read_text())
 
 
 @pytest.mark.unit

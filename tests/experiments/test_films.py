@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import csv
+import subprocess
+import sys
+import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import replace
@@ -21,12 +24,12 @@ from envs_host.create.films import episode_frames
 from envs_host.create.hosting import CreateHost
 from envs_host.create.illustration import RenderOptions
 from experiments import _films, _jobs, _paper_figures
-from experiments import _flags as flag
 from experiments._artifacts import Domain
 from experiments._figure_list import FIGURES, PaperFigure
 from experiments._films import HostEpisode, checked_outcome, film_run, play_host_episodes
 from experiments._flags import UsageError, load_task
-from experiments._production import Cell, Source
+from experiments._production import Cell, Source, find
+from experiments._runs import read_runs
 from experiments._searches import GRIDS, chosen, search_parts
 from experiments._training import TrainConfig, Trainer, save_inputs
 from jaxnew import config as config_lib
@@ -35,7 +38,7 @@ from jaxnew.metrics import MetricsLog
 from jaxnew.representation.table import engineered_table
 from jaxnew.run_directory import RunDirectory
 from jaxnew.task import Film
-from tests.experiments.commands import read_json
+from tests.experiments.commands import ROOT, read_json
 from tests.experiments.handwritten import plain_config, write_run
 
 PLACE = "tests.toy_task:TASK"
@@ -216,9 +219,25 @@ def flagged(**values: Any) -> Iterator[None]:
 # ---- Runs that are made on the host ----
 
 
+def source_of_toy(folder: Path) -> tuple[Any, ...]:
+    domain = Domain.of(load_task(PLACE), None)
+    return domain, folder, "smoke", "smoke", 0.0, (1,), (), {}
+
+
+def run_and_kill(job: _jobs.Job, folder: Path) -> None:
+    """Starts a command, and ends it at its first checkpoint as a power cut would."""
+    process = subprocess.Popen([sys.executable, "-m", *job._module, *job.command[1:]], cwd=ROOT)
+    while process.poll() is None and not Checkpointer(folder / "checkpoints").steps("latest"):
+        time.sleep(0.005)
+    assert process.poll() is None
+    process.kill()
+    process.wait()
+    raise UsageError("Stopped.")
+
+
 @pytest.mark.integration
 def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     cells = {"toy": (TOY,)}
     monkeypatch.setitem(FIGURES, "4", PaperFigure("bars", "toys", cells))
@@ -237,19 +256,25 @@ def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
     )
     with flagged(task=PLACE, budget="smoke", runs=str(tmp_path), workers=1):
         assert _paper_figures.make(values) == []
-        planned = capsys.readouterr().out
+        planned = capfd.readouterr().out
         assert planned.count("python -m experiments.train") == 1  # Both figures need it.
         assert "30 episodes of evaluation" in planned  # 2 bars and 3 points.
         assert not any(tmp_path.iterdir())
         values.dry_run = False
-        files = _paper_figures.make(values)
         run = tmp_path / "toy" / "ours-gt4-default-smoke-4-1"
-        assert flag.RUNS.value == str(tmp_path)
+        with monkeypatch.context() as killed:
+            killed.setattr(_jobs.Job, "run", lambda job: run_and_kill(job, run))
+            with pytest.raises(UsageError, match="Stopped"):
+                _paper_figures.make(values)
+        assert Checkpointer(run / "checkpoints").steps("latest")[-1] < 4
+        assert not find(Source(*source_of_toy(tmp_path)), TOY)
+        files = _paper_figures.make(values)
+        assert "resuming" in capfd.readouterr().out
         before = {file: file.stat().st_mtime_ns for file in run.rglob("*.json*")}
         monkeypatch.setattr(_jobs.Job, "run", lambda job: pytest.fail(job.text))
         assert _paper_figures.make(values) == files
         assert before == {file: file.stat().st_mtime_ns for file in run.rglob("*.json*")}
-        assert "All runs and evaluations are there" in capsys.readouterr().out
+        assert "All runs and evaluations are there" in capfd.readouterr().out
     assert [file.name for file in files] == [
         *("figure_4.png", "figure_4.md", "figure_4.csv"),
         *("figure_9c.png", "figure_9c.md", "figure_9c.csv"),
@@ -276,7 +301,7 @@ def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
 @pytest.mark.unit
 def test_a_search_on_the_host_is_a_run_for_each_value_and_seed(tmp_path: Path) -> None:
     domain = Domain.of(load_task(PLACE), None)
-    source = Source(domain, tmp_path, "smoke", "smoke", 0.0, (1, 2), (), {})
+    source = replace(Source(*source_of_toy(tmp_path)), seeds=(1, 2))
     parts = search_parts("entropy", source, TOY, (0.01, 0.1))
     folder = tmp_path / "toy" / "search-entropy-ours-gt4-smoke-4"
     names = [part.folder.relative_to(folder).name for part in parts]
@@ -310,7 +335,7 @@ def test_a_search_on_the_host_is_a_run_for_each_value_and_seed(tmp_path: Path) -
         )
         write_run(part.folder, config, curve=(2 * best, best))
         assert part.is_finished
-        runs += _paper_figures.read_runs([part.folder])
+        runs += read_runs([part.folder])
     study = chosen("entropy", GRIDS["entropy"], runs)
     assert [(p.x, p.means.tolist()) for p in study.points] == [
         (0.01, [0.2, 0.4]),
