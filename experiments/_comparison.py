@@ -74,7 +74,7 @@ def compare_curves(groups: Sequence[Group]) -> list[CurvePoint]:
 
 
 def _paper_at(group: Group, split: str, steps: float) -> tuple[float | None, float | None]:
-    if group.paper_method is None:
+    if group.paper_method is None or not group.is_default_split:  # There is no curve of another.
         return None, None
     curve = paper_curve(str(group.paper_environment), group.paper_method, split)
     if curve is None or not curve.steps[0] <= steps <= curve.steps[-1]:

@@ -12,7 +12,7 @@ from experiments import _flags as flag
 from experiments import _plots as plots
 from experiments._artifacts import REPRESENTATION_SEED, Domain
 from experiments._curves import CurveSetting, RunCurve, learning_curves
-from experiments._paper import PaperCurve, paper_curve
+from experiments._paper import PaperCurve, paper_curve, paper_method
 from experiments._plots import Bar, BarSetting, Color, Scatter
 from experiments._results import ResultRow
 from experiments._runs import Group, Run
@@ -32,6 +32,7 @@ _COLOR_INDEX = {
     "ours": 3,
     "ours_engineered": 4,
     "ours_onehot": 5,
+    "ours_video": 5,
     "ours_oracle_hvae": 6,
     "vae": 7,
     "continuous_output": 8,
@@ -73,19 +74,18 @@ def run_curves(group: Group, split: str) -> list[RunCurve]:
 def _paper_curves(group: Group) -> tuple[dict[str, PaperCurve], str]:
     """The paper's curves beside a group, and their label.
 
-    The paper shows none for the other representations of its own method; those get the curves of
-    its default representation, under that name.
+    The paper shows none for the other representations and variants of its own method; those get the
+    curves of its default, under that name.
     """
     method = group.paper_method
-    if method is None:
+    if method is None or not group.is_default_split:  # There is no curve of another split.
         return {}, ""
     environment = str(group.paper_environment)
     label = f"paper, {method}"
     if paper_curve(environment, method, CURVE_SPLITS[0]) is None:
-        method, label = (
-            "ours",
-            f"paper, ours on HVAE (none for {group.runs[0].representation})",
-        )
+        is_variant = paper_method("ours", group.representation) == "ours"
+        lacking = method if is_variant else group.representation
+        method, label = "ours", f"paper, ours on HVAE (none for {lacking})"
     found = {split: paper_curve(environment, method, split) for split in CURVE_SPLITS}
     return {split: curve for split, curve in found.items() if curve is not None}, label
 
@@ -138,8 +138,7 @@ def _note(num_seeds: Sequence[int], steps: float | None) -> str:
     seeds = f"{number} seed{'s' if high > 1 else ''}"
     if steps is None:
         return seeds
-    amount = f"{1e-6 * steps:.3g} M" if steps >= 1e6 else f"{1e-3 * steps:.3g} k"
-    return f"{seeds}\n{amount} steps"
+    return f"{seeds}\n{plots.amount(steps)}"
 
 
 def environment_of(groups: Sequence[Group]) -> str:
@@ -203,12 +202,13 @@ def tsne_panel(
 
 
 def representations_figure(
-    domain: Domain, tables: Mapping[str, RepresentationTable], title: str
+    tables: Mapping[str, tuple[Domain, RepresentationTable]], title: str
 ) -> Figure:
-    """Held-out actions as each table places them."""
+    """Held-out actions as each table places them; domains may differ in their splits."""
     panels = [
         tsne_panel(domain, table, "heldout", REPRESENTATION_SEED, name)
-        for name, table in tables.items()
+        for name, (domain, table) in tables.items()
     ]
     shown = [panel for panel in panels if panel is not None]
+    ((domain, _), *_) = tables.values()
     return plots.tsne_scatter(shown, domain.universe.class_names, title)

@@ -85,15 +85,18 @@ def file_stem(content: dict[str, Any]) -> str:
     return f"{stem}{grown}"
 
 
-def evaluate_run(path: Path, set_sizes: Mapping[str, int | None], num_episodes: int) -> None:
+def evaluate_run(
+    path: Path, set_sizes: Mapping[str, int | None], num_episodes: int, num_workers: int = 0
+) -> None:
     """Evaluates the best checkpoint of a run on parts of its split, and keeps the results.
 
     Args:
       set_sizes: by part, actions per set; None for as many as in training.
+      num_workers: processes for environments on the host; 0: one per core.
     """
-    run, trainer, split = load_trainer(path)
-    state, step = load_state(run, trainer, "best")
+    run, trainer, split = load_trainer(path, num_workers)
     with closing(trainer):
+        state, step = load_state(run, trainer, "best")
         for name, set_size in set_sizes.items():
             row = evaluate_on(
                 trainer,

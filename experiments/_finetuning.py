@@ -13,10 +13,11 @@ from matplotlib.figure import Figure
 from experiments import _plots as plots
 from experiments._curves import RunCurve, reference_curves
 from experiments._evaluation import evaluate_run
+from experiments._jobs import Job, duration, training_seconds
 from experiments._methods import adapted, trained_ids
 from experiments._paper import paper_value
 from experiments._plots import Color, Metric
-from experiments._production import Job, Source, duration, training_seconds
+from experiments._production import Source
 from experiments._runs import Group, read_runs
 from jaxnew.task import StageTwoBudget
 
@@ -82,6 +83,7 @@ def finetune_job(
         f"--set=num_updates={budget.num_updates}",
         f"--workdir={finetune_folder(path, budget, kind)}",
         *(["--scratch"] if kind == "scratch" else []),
+        *([f"--workers={source.workers}"] if source.workers else []),
     )
     trained = VARIANTS[method][0]
     seconds = training_seconds(source, trained, budget.num_updates * budget.ppo.steps_per_update, 1)
@@ -145,12 +147,15 @@ def _references(source: Source, group: Group, num_episodes: int) -> list[Referen
     """Zero-shot: on sets as in training, and on all test actions at once; ours and the paper's."""
     domain = source.domain
     whole = len(trained_ids("no-subsampling", domain.task, domain.split, "test"))
+    whole += len(domain.split.always_available)
     sizes = {"sets as in training": group.set_size("test"), "all at once": whole}
     references = []
     for (name, size), published in zip(
         sizes.items(), ("ours_zero_shot", "ours_zero_shot_whole_test_set"), strict=True
     ):
-        means = [_zero_shot(run.path, size, group, num_episodes) for run in group.runs]
+        means = [
+            _zero_shot(run.path, size, group, num_episodes, source.workers) for run in group.runs
+        ]
         references.append(Reference(f"ours, zero-shot, {name} ({size})", float(np.mean(means))))
         if group.paper_environment is not None:
             paper = paper_value(group.paper_environment, published, "test")
@@ -159,7 +164,9 @@ def _references(source: Source, group: Group, num_episodes: int) -> list[Referen
     return references
 
 
-def _zero_shot(path: Path, set_size: int | None, group: Group, num_episodes: int) -> float:
+def _zero_shot(
+    path: Path, set_size: int | None, group: Group, num_episodes: int, num_workers: int
+) -> float:
     """Mean of a run on test sets of a size; evaluated now if it is not there."""
 
     def found() -> list[float]:
@@ -174,7 +181,7 @@ def _zero_shot(path: Path, set_size: int | None, group: Group, num_episodes: int
 
     if not found():
         print(f"Evaluating {path} on test sets of {set_size}.", flush=True)
-        evaluate_run(path, {"test": set_size}, num_episodes)
+        evaluate_run(path, {"test": set_size}, num_episodes, num_workers)
     return found()[0]
 
 

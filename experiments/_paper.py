@@ -26,9 +26,13 @@ _METHODS = {
     ("ours", "hvae"): "ours",
     ("ours", "hvae-xy"): "ours",
     ("ours", "hvae-onehot"): "ours_onehot",
+    ("ours", "hvae-state"): "ours",
+    ("ours", "hvae-video"): "ours_video",
     ("ours", "gt12"): "ours_engineered",
+    ("ours", "gt32"): "ours_engineered",
     ("ours", "vae"): "vae",
     ("ours", "vae-xy"): "vae",
+    ("ours", "vae-state"): "vae",
     ("ours", "product"): "ours",
     ("ours", "product-mu"): "ours",
     ("ours", "hvae-oracle"): "ours_oracle_hvae",
@@ -40,10 +44,12 @@ _BASELINES = {
     "continuous": "continuous_output",
     "nearest-neighbour": "nearest_neighbor",
 }
-_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "product", "product-mu")
+_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "hvae-state", "product", "product-mu")
 
 # Where a representation makes the paper's results those of an environment of its own.
 _ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"}
+# Figure of a split that is not the domain's default; its rows have the same names of methods.
+_SPLIT_FIGURES = {"full": "fig7a_create_full_split"}
 # Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
 _SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
@@ -94,11 +100,27 @@ class PaperCurve(NamedTuple):
     std: np.ndarray
 
 
-def paper_method(method: str, representation: str) -> str | None:
-    """What the paper calls our method on our representation; None if it did not run it."""
+def paper_method(method: str, representation: str, variant: str = "") -> str | None:
+    """What the paper calls our method on our representation; None if it did not run it.
+
+    Args:
+      method: ours, such as `no-entropy`.
+      representation: ours, such as `hvae`.
+      variant: of the domain or of the policy, see `Task.paper_variant`.
+    """
     if method in _BASELINES and representation in _DEFAULT_REPRESENTATIONS:
-        return _BASELINES[method]
-    return _METHODS.get((method, representation))
+        name: str | None = _BASELINES[method]
+    else:
+        name = _METHODS.get((method, representation))
+    if name is None or not variant:
+        return name
+    name = f"{name}_{variant}"
+    return name if any(row.method == name for row in _results()) else None
+
+
+def paper_figure_of_split(split: str) -> str | None:
+    """The figure that has the rows of a split which is not the default; None if there is none."""
+    return _SPLIT_FIGURES.get(split)
 
 
 def paper_environment(environment: str | None, representation: str) -> str | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,100 +22,18 @@ from experiments._drawing import (
     standard_rows,
 )
 from experiments._evaluation import evaluate_run
+from experiments._figure_list import FIGURES, PaperFigure, number_of
+from experiments._films import film_run
 from experiments._finetuning import finetune_figure, finetune_seconds, make_finetuned
-from experiments._production import (
-    Cell,
-    Job,
-    Source,
-    duration,
-    embed_job,
-    evaluation_seconds,
-    find,
-    sweep_job,
-)
+from experiments._jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
+from experiments._production import Cell, Source, find
 from experiments._results import ResultRow, as_csv, as_markdown, result_rows
-from experiments._runs import Group, Run, group_runs
+from experiments._runs import Group, Run, group_runs, read_runs
+from experiments._studies import lacking_values, study_runs
+from experiments._study_report import write_study
 from jaxnew.representation.table import RepresentationTable
 
-_BASELINES = ("ours", "continuous", "nearest-neighbour")
-_ABLATIONS = ("ours", "no-entropy", "no-subsampling")
-_ALL = ("ours", "continuous", "nearest-neighbour", "no-entropy", "no-subsampling")
-
-
-@dataclass(frozen=True)
-class PaperFigure:
-    """A figure of the paper.
-
-    Attributes:
-      kind: bars, curves, finetune or representations.
-      title: what it shows.
-      cells: its settings, by task. Of a picture of representations, only these count.
-      budget: suffix of the preset of its runs.
-    """
-
-    kind: str
-    title: str
-    cells: Mapping[str, tuple[Cell, ...]]
-    budget: str = ""
-
-
-def _cells(methods: Sequence[str], representation: str, *more: str) -> tuple[Cell, ...]:
-    """Methods on one representation, then ours on further ones."""
-    extra = tuple(Cell("ours", name) for name in more)
-    return (*(Cell(method, representation) for method in methods), *extra)
-
-
-FIGURES: dict[str, PaperFigure] = {
-    "4": PaperFigure(
-        "bars",
-        "baselines",
-        {
-            "grid_world": _cells(_BASELINES, "hvae", "vae"),
-            "recommender": _cells(_BASELINES, "product"),
-        },
-    ),
-    "6": PaperFigure(
-        "bars",
-        "ablations",
-        {
-            "grid_world": _cells(_ABLATIONS, "hvae"),
-            "recommender": _cells(_ABLATIONS, "product"),
-        },
-    ),
-    "7b": PaperFigure(
-        "bars",
-        "alternate representations",
-        {"grid_world": _cells(("ours",), "hvae", "hvae-onehot", "gt12", "hvae-oracle")},
-    ),
-    "14": PaperFigure(
-        "representations",
-        "held-out actions",
-        {"grid_world": _cells((), "hvae", "hvae", "vae", "hvae-onehot", "gt12")},
-    ),
-    "19": PaperFigure(
-        "finetune",
-        "training on new actions",
-        {
-            "grid_world": _cells(("ours", "nearest-neighbour"), "hvae"),
-            "recommender": _cells(("ours", "nearest-neighbour"), "product"),
-        },
-    ),
-    "22": PaperFigure(
-        "bars",
-        "fully observable",
-        {"recommender": _cells(_ALL, "product-mu")},
-        budget="-mu",
-    ),
-    "24": PaperFigure(
-        "curves",
-        "learning curves",
-        {
-            "grid_world": _cells(_ALL, "hvae", "vae"),
-            "recommender": _cells(_ALL, "product"),
-        },
-    ),
-}
-_SAME = {"10": "19"}  # Figure 10 is figure 19 for CREATE Push.
+Setting = tuple[Source, Cell]  # A cell, and where its runs come from.
 
 
 def define_flags() -> None:
@@ -127,12 +45,19 @@ def define_flags() -> None:
     flags.DEFINE_float("finetune_steps", 0.0, "The same of fine-tuning.")
     flags.DEFINE_integer("episodes", 5000, "Episodes of each evaluation.")
     flags.DEFINE_multi_string(
-        "given", [], "NAME=PATH: a table (.npz) or run of embed to take for a representation."
+        "given",
+        [],
+        "NAME=PATH: a table (.npz) or run of embed to take for a representation; NAME@SPLIT=PATH "
+        "or NAME@VARIANT=PATH where a figure has one of another split or of other actions (7a, 15: "
+        "hvae@full; 9a-c: hvae-oracle@analysis).",
     )
     flags.DEFINE_string(
         "representation_budget", None, "Budget of representations to be trained; default: --budget."
     )
     flags.DEFINE_bool("dry_run", False, "Only say what is missing and how long it takes.")
+    flags.DEFINE_integer("films", 20, "Episodes that figure 8 shows.", lower_bound=1)
+    flags.DEFINE_integer("film_size", 512, "Pixels of their side.", lower_bound=16)
+    flags.DEFINE_enum("film_format", "gif", ["gif", "mp4"], "Of their files; mp4: jaxnew[video].")
 
 
 def make(values: Any) -> list[Path]:
@@ -143,9 +68,7 @@ def make(values: Any) -> list[Path]:
     """
     task = flag.load_task(flag.TASK.value)
     domain = Domain.of(task, flag.SPLIT.value)
-    chosen = {}
-    for number in values.figure:
-        chosen[_SAME.get(number, number)] = figure_of(number, task.name)
+    numbers = list(dict.fromkeys(number_of(number, task.name) for number in values.figure))
     source = Source(
         domain=domain,
         folder=Path(flag.RUNS.value),
@@ -155,14 +78,19 @@ def make(values: Any) -> list[Path]:
         seeds=tuple(map(int, values.seeds)),
         assignments=tuple(flag.SET.value),
         given=parse_given(values.given),
+        workers=flag.WORKERS.value,
     )
-    work = [
-        (figure, _source_of(source, figure), figure.cells[task.name]) for figure in chosen.values()
+    figures = [FIGURES[number] for number in numbers]
+    settings = [settings_of(figure, source) for figure in figures]
+    work = list(zip(figures, settings, strict=True))
+    jobs = unique_jobs([job for f, own in work for job in missing_jobs(f, own)])
+    episodes = sum(missing_episodes(f, own, values.episodes) for f, own in work)
+    tuned = [
+        finetune_seconds(own[0][0], values.finetune_steps)
+        for f, own in work
+        if f.kind == "finetune"
     ]
-    jobs = unique_jobs([job for f, s, cells in work for job in missing_jobs(f, s, cells)])
-    evaluations = sum(missing_evaluations(f, s, cells, values.episodes) for f, s, cells in work)
-    tuned = [finetune_seconds(s, values.finetune_steps) for f, s, _ in work if f.kind == "finetune"]
-    announce(jobs, evaluations, evaluation_seconds(source, evaluations), tuned)
+    announce(jobs, episodes, evaluation_seconds(source, episodes), tuned)
     if values.dry_run:
         return []
     for job in jobs:
@@ -170,25 +98,44 @@ def make(values: Any) -> list[Path]:
     out = Path(values.out) if values.out else domain.folder(source.folder) / "figures"
     out.mkdir(parents=True, exist_ok=True)
     written: list[Path] = []
-    for (number, figure), (_, own, cells) in zip(chosen.items(), work, strict=True):
-        written += draw(number, figure, own, cells, out, values)
+    for number, (figure, own) in zip(numbers, work, strict=True):
+        written += draw(number, figure, own, out, values)
     return written
 
 
-def figure_of(number: str, task: str) -> PaperFigure:
-    """A figure by its number.
+def film_given(values: Any) -> list[Path]:
+    """Figure 8 of a run that is given.
 
     Raises:
-      UsageError: there is none, or it does not show the task.
+      UsageError: several are given, or it is no run of the task or of a policy.
     """
-    figure = FIGURES.get(_SAME.get(number, number))
-    if figure is None:
-        raise flag.UsageError(f"No figure {number!r}; choose of {', '.join([*FIGURES, *_SAME])}.")
-    if task not in figure.cells:
+    if len(values.run) != 1:
+        raise flag.UsageError(f"Figure 8 shows one run; {len(values.run)} were given.")
+    (run,) = read_runs([Path(values.run[0])])
+    task = flag.load_task(flag.TASK.value)
+    if not run.is_policy or run.config["task"] != task.reference:
         raise flag.UsageError(
-            f"Figure {number} does not show {task}; it shows {', '.join(figure.cells)}."
+            f"{run.path} is no run of train of task {task.name}; say which with --task."
         )
-    return figure
+    (group,) = group_runs([run])
+    out = Path(values.out) if values.out else run.path / "figures"
+    title = f"Figure 8, {environment_of([group])}: {group.label}"
+    suffix = f".{values.film_format}"
+    size, workers = values.film_size, flag.WORKERS.value
+    return film_run(run.path, out / "figure_8", values.films, size, suffix, title, workers)
+
+
+def settings_of(figure: PaperFigure, source: Source) -> list[Setting]:
+    """The cells of a figure for the source's task, each with its own source.
+
+    One with the preset of the figure, where the task has it; of films, the first seed alone.
+    """
+    name = source.budget + figure.budget
+    if name in source.domain.task.stage_two:
+        source = replace(source, budget=name)
+    if figure.kind == "films":
+        source = replace(source, seeds=source.seeds[:1])
+    return [(source.of(cell), cell) for cell in figure.cells[source.domain.task.name]]
 
 
 def parse_given(entries: Sequence[str]) -> dict[str, Path]:
@@ -206,21 +153,14 @@ def parse_given(entries: Sequence[str]) -> dict[str, Path]:
     return given
 
 
-def _source_of(source: Source, figure: PaperFigure) -> Source:
-    """The source with the preset of the figure, where the task has it."""
-    name = source.budget + figure.budget
-    has_own = name in source.domain.task.stage_two
-    return replace(source, budget=name if has_own else source.budget)
-
-
-def missing_jobs(figure: PaperFigure, source: Source, cells: Sequence[Cell]) -> list[Job]:
+def missing_jobs(figure: PaperFigure, settings: Sequence[Setting]) -> list[Job]:
     """What must be made before the figure's runs can be evaluated, in order."""
-    jobs = [embed_job(source, cell.representation) for cell in cells]
+    jobs = [embed_job(source, cell.representation) for source, cell in settings]
     if figure.kind != "representations":
-        for cell in cells:
+        for source, cell in settings:
             found = find(source, cell)
             lacking = [seed for seed in source.seeds if seed not in found]
-            jobs += [sweep_job(source, cell, lacking)] if lacking else []
+            jobs += training_jobs(source, cell, lacking)
     return [job for job in jobs if job is not None]
 
 
@@ -229,17 +169,21 @@ def unique_jobs(jobs: Sequence[Job]) -> list[Job]:
     return list({job.command: job for job in jobs}.values())
 
 
-def missing_evaluations(
-    figure: PaperFigure, source: Source, cells: Sequence[Cell], num_episodes: int
-) -> int:
+def missing_episodes(figure: PaperFigure, settings: Sequence[Setting], num_episodes: int) -> int:
     """Episodes of the evaluations that the figure still needs, also of runs yet to be made."""
-    if figure.kind != "bars":
+    if figure.kind not in ("bars", "study"):
         return 0
     missing = 0
-    for cell in cells:
+    for source, cell in settings:
+        task = source.domain.task
         found = find(source, cell)
-        missing += sum(len(lacking_splits(run, num_episodes)) for run in found.values())
-        missing += len(BAR_SPLITS) * (len(source.seeds) - len(found))
+        of_new = len(BAR_SPLITS if figure.kind == "bars" else task.studies[figure.study].values)
+        missing += of_new * (len(source.seeds) - len(found))
+        for run in found.values():
+            if figure.kind == "bars":
+                missing += len(lacking_splits(run, num_episodes))
+            else:
+                missing += len(lacking_values(figure.study, run, task, num_episodes))
     return missing * num_episodes
 
 
@@ -250,62 +194,63 @@ def lacking_splits(run: Run, num_episodes: int) -> list[str]:
     return [s for s in BAR_SPLITS if s not in rows or rows[s].num_episodes < num_episodes]
 
 
-def announce(
-    jobs: Sequence[Job], episodes: int, evaluation: float | None, tuned: Sequence[float | None]
-) -> None:
-    """Says what will be made and how long it takes."""
-    if not jobs and not episodes and not tuned:
-        print("All runs and evaluations are there.")
-        return
-    print("Missing:")
-    for job in jobs:
-        print(f"  {job.title}: {job.cost}\n    {job.text}")
-    if episodes:
-        print(f"  {episodes:,} episodes of evaluation: {duration(evaluation)}")
-    for seconds in tuned:
-        print(f"  fine-tuning and its zero-shot lines, where not there: up to {duration(seconds)}")
-    numbers = [job.seconds for job in jobs] + ([evaluation] if episodes else []) + list(tuned)
-    known = [seconds for seconds in numbers if seconds is not None]
-    unknown = f", and {len(numbers) - len(known)} unmeasured" if len(known) < len(numbers) else ""
-    print(
-        f"  In all {duration(sum(known))}{unknown}. It can be stopped, and called again to go on."
-    )
-
-
 def draw(
-    number: str,
-    figure: PaperFigure,
-    source: Source,
-    cells: Sequence[Cell],
-    out: Path,
-    values: Any,
+    number: str, figure: PaperFigure, settings: Sequence[Setting], out: Path, values: Any
 ) -> list[Path]:
     """The files of one figure; evaluates what is not evaluated yet."""
     name = f"figure_{number}"
     if figure.kind == "representations":
-        tables = {cell.representation: table_of(source, cell.representation) for cell in cells}
-        picture = representations_figure(source.domain, tables, f"Figure {number}: {figure.title}")
+        panels = representation_panels(settings)
+        picture = representations_figure(panels, f"Figure {number}: {figure.title}")
         return plots.save(picture, out / f"{name}.png", values.pdf)
-    groups = [group_of(source, cell) for cell in cells]
+    groups = [group_of(source, cell) for source, cell in settings]
     title = f"Figure {number}, {environment_of(groups)}: {figure.title}"
+    first, _ = settings[0]
+    if figure.kind == "films":
+        (run,) = groups[0].runs
+        size, suffix = values.film_size, f".{values.film_format}"
+        return film_run(run.path, out / name, values.films, size, suffix, title, first.workers)
+    if figure.kind == "study":
+        paths = [run.path for group in groups for run in group.runs]
+        study = study_runs(figure.study, paths, (), values.episodes, num_workers=first.workers)
+        return write_study(study, out, name, values.pdf)
     if figure.kind == "finetune":
-        curves = make_finetuned(source, groups, values.finetune_steps, values.episodes)
+        curves = make_finetuned(first, groups, values.finetune_steps, values.episodes)
         return plots.save(finetune_figure(curves, title), out / f"{name}.png", values.pdf)
     if figure.kind == "curves":
-        comparison = compare_curves(groups)
-        (out / f"{name}.csv").write_text(comparison_csv(comparison), encoding="utf-8")
-        text = comparison_markdown(title, comparison, groups[0].metric)
-        (out / f"{name}.md").write_text(text, encoding="utf-8")
-        drawn = curves_figure(groups, title)
-        files = plots.save(drawn, out / f"{name}.png", values.pdf) if drawn else []
-        return [*files, out / f"{name}.md", out / f"{name}.csv"]
+        return draw_curves(name, title, groups, out, values.pdf)
     for group in groups:
-        evaluate_missing(group, values.episodes)
-    groups = [group_of(source, cell) for cell in cells]
+        evaluate_missing(group, values.episodes, first.workers)
+    groups = [group_of(source, cell) for source, cell in settings]
     rows = {g.label: [r for r in result_rows(g) if r.is_standard] for g in groups}
     drawn = bars_figure(groups, rows, title)
     files = plots.save(drawn, out / f"{name}.png", values.pdf) if drawn else []
-    return files + write_results(name, title, groups, rows, out)
+    notes = [figure.note] if figure.note else []
+    return files + write_results(name, title, groups, rows, out, notes)
+
+
+def representation_panels(
+    settings: Sequence[Setting],
+) -> dict[str, tuple[Domain, RepresentationTable]]:
+    """What a picture of representations shows, by the name above it."""
+    panels = {}
+    for source, cell in settings:
+        name = f"{cell.representation}, split {cell.split}" if cell.split else cell.representation
+        panels[name] = source.domain, table_of(source, cell.representation)
+    return panels
+
+
+def draw_curves(
+    name: str, title: str, groups: Sequence[Group], out: Path, pdf: bool = False
+) -> list[Path]:
+    """Learning curves, and tables of where they stand beside the paper's."""
+    comparison = compare_curves(groups)
+    (out / f"{name}.csv").write_text(comparison_csv(comparison), encoding="utf-8")
+    text = comparison_markdown(title, comparison, groups[0].metric)
+    (out / f"{name}.md").write_text(text, encoding="utf-8")
+    drawn = curves_figure(groups, title)
+    files = plots.save(drawn, out / f"{name}.png", pdf) if drawn else []
+    return [*files, out / f"{name}.md", out / f"{name}.csv"]
 
 
 def table_of(source: Source, representation: str) -> RepresentationTable:
@@ -329,20 +274,21 @@ def group_of(source: Source, cell: Cell) -> Group:
     lacking = [seed for seed in source.seeds if seed not in found]
     if lacking:
         raise flag.UsageError(
-            f"{cell.method} on {cell.representation} is not finished for seeds {lacking}; call the "
-            "same command again to go on."
+            f"{cell.label} is not finished for seeds {lacking}; call the same command again to go "
+            "on."
         )
     runs = tuple(found[seed] for seed in source.seeds)
-    return Group(f"{cell.method}, {cell.representation}", source.domain.task, runs)
+    return Group(cell.label, source.domain.task, runs)
 
 
-def evaluate_missing(group: Group, num_episodes: int) -> None:
+def evaluate_missing(group: Group, num_episodes: int, num_workers: int = 0) -> None:
     """Evaluates every run of a group where its bars need it."""
     for run in group.runs:
         lacking = lacking_splits(run, num_episodes)
         if lacking:
             print(f"Evaluating {run.path} on {' and '.join(lacking)} actions.", flush=True)
-            evaluate_run(run.path, {name: group.set_size(name) for name in lacking}, num_episodes)
+            sizes = {name: group.set_size(name) for name in lacking}
+            evaluate_run(run.path, sizes, num_episodes, num_workers)
 
 
 def write_results(
@@ -351,9 +297,10 @@ def write_results(
     groups: Sequence[Group],
     rows: Mapping[str, Sequence[ResultRow]],
     out: Path,
+    notes: Sequence[str] = (),
 ) -> list[Path]:
     """The numbers of the bars as Markdown and CSV."""
     flat = [row for group in groups for row in rows[group.label]]
-    (out / f"{name}.md").write_text(as_markdown(title, flat, groups[0].metric, []), "utf-8")
+    (out / f"{name}.md").write_text(as_markdown(title, flat, groups[0].metric, notes), "utf-8")
     (out / f"{name}.csv").write_text(as_csv(flat), "utf-8")
     return [out / f"{name}.md", out / f"{name}.csv"]

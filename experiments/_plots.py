@@ -66,6 +66,13 @@ class Metric:
         return f"{value * self.scale:.1f}" if self.scale == 100.0 else f"{value:.3f}"
 
 
+def amount(steps: float) -> str:
+    """Environment steps for reading."""
+    if steps < 1e3:
+        return f"{steps:.0f} steps"
+    return f"{1e-6 * steps:.3g} M steps" if steps >= 1e6 else f"{1e-3 * steps:.3g} k steps"
+
+
 @dataclass(frozen=True)
 class Bar:
     """A mean with the ends of its error bar."""
@@ -224,7 +231,8 @@ def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: s
       class_names: legend, in label order; classes without a point are left out.
       title: of the figure.
     """
-    figure = new_figure(4.6 * len(panels), 4.8)
+    width = 4.6 * len(panels)
+    figure = new_figure(width, 4.8)
     colors = hls_palette(len(class_names))
     shown: dict[str, Any] = {}
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -248,12 +256,17 @@ def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: s
         [shown[name] for name in names],
         names,
         loc="outside lower center",
-        ncols=min(4 * len(panels), len(class_names)),
+        ncols=max(1, min(4 * len(panels), len(names), int(width / _legend_entry(names)))),
         **narrow,
         **LEGEND,
     )
     set_title(figure, title)
     return figure
+
+
+def _legend_entry(names: Sequence[str]) -> float:
+    """Inches that the longest name takes in a legend, with its mark and the space behind it."""
+    return 0.5 + 0.075 * max(map(len, names), default=0)
 
 
 def save(figure: Figure, path: Path, pdf: bool = False) -> list[Path]:

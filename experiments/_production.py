@@ -1,22 +1,17 @@
-"""The runs that figures need: found below a folder, or made by the commands that make runs."""
+"""The runs that figures need: what tells them apart, and where they are found."""
 
 from __future__ import annotations
 
 import math
-import os
-import shlex
-import signal
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain, parse_representation
-from experiments._flags import UsageError, budget_of
-from experiments._methods import adapted, file_name
+from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
+from experiments._flags import UsageError, budget_of, load_task
+from experiments._methods import adapted
 from experiments._runs import Run, read_runs
 from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable
@@ -28,10 +23,32 @@ _EQUAL = ("num_updates", "hyperparameters", "ppo")  # Fields that make runs the 
 
 @dataclass(frozen=True)
 class Cell:
-    """One setting of a figure: `--method` and `--representation`."""
+    """One setting of a figure.
+
+    Attributes:
+      method, representation: `--method` and `--representation`.
+      variant: what the name of its task has after that of the figure's, such as `-no-subgoals`.
+      split: `--split`; empty for that of the figure.
+      conditions_position: see `TrainConfig`.
+    """
 
     method: str
     representation: str
+    variant: str = ""
+    split: str = ""
+    conditions_position: bool = False
+
+    @property
+    def label(self) -> str:
+        """What tells it from the other settings of a figure."""
+        words = [
+            self.method,
+            self.representation,
+            self.variant.removeprefix("-").replace("-", " "),
+            self.split and f"split {self.split}",
+            "conditioned position" if self.conditions_position else "",
+        ]
+        return ", ".join(word for word in words if word)
 
 
 @dataclass(frozen=True)
@@ -46,7 +63,10 @@ class Source:
       steps: environment steps of every run; 0 for those of the preset.
       seeds: of the policies.
       assignments: of `--set`.
-      given: tables and runs of `embed` to take for a representation.
+      given: tables and runs of `embed` to take for a representation; where a cell has other actions
+        or another split than `domain`, those under `REPRESENTATION@VARIANT` or
+        `REPRESENTATION@SPLIT`.
+      workers: processes for environments on the host; 0: one per core.
     """
 
     domain: Domain
@@ -57,6 +77,27 @@ class Source:
     seeds: tuple[int, ...]
     assignments: tuple[str, ...]
     given: Mapping[str, Path]
+    workers: int = 0
+
+    def of(self, cell: Cell) -> Source:
+        """Where the runs of a cell come from: those of its own task and split.
+
+        Raises:
+          UsageError: there is no such variant of the task.
+          ValueError: it has no such split.
+        """
+        task, split = self.domain.task, cell.split or self.domain.split_name
+        if cell.variant:
+            task = load_task(task.reference + cell.variant)
+        if task is self.domain.task and split == self.domain.split_name:
+            return self
+        given = self.given
+        words = [cell.variant.strip("-")] * (task.actions_name != self.domain.task.actions_name)
+        words += [split] * (split != self.domain.split_name)
+        if words:
+            end = f"@{'-'.join(words)}"
+            given = {k.removesuffix(end): path for k, path in given.items() if k.endswith(end)}
+        return replace(self, domain=Domain.of(task, split), given=given)
 
     def budget_of(self, method: str) -> StageTwoBudget:
         """What a run of the method spends."""
@@ -101,12 +142,13 @@ def find(source: Source, cell: Cell) -> dict[int, Run]:
             config["method"] == cell.method
             and config["trained_on"] == "train"
             and not config.get("num_clusters", 0)
+            and bool(config.get("conditions_position", False)) == cell.conditions_position
             and config["split_hash"] == source.domain.split.hash
             and run.representation == cell.representation
             and _plain(config) == wanted
             and config["seed"] in source.seeds
             and (table is None or config["table_hash"] == table.hash)
-            and run.trained_steps >= config["num_updates"] * run.steps_per_update
+            and run.is_finished
         )
         if not is_wanted:
             continue
@@ -137,131 +179,3 @@ def _plain(config: Any) -> dict[str, Any]:
     plain = config if isinstance(config, dict) else config_lib.to_dict(config)
     fields = {name: plain[name] for name in _EQUAL}
     return {**fields, "ppo": {**fields["ppo"], "microbatch_size": 0}}
-
-
-@dataclass(frozen=True)
-class Job:
-    """A command that makes something that is missing.
-
-    Attributes:
-      title: what it makes.
-      command: `python -m experiments.NAME` without its beginning.
-      cost: how long it takes.
-      seconds: the same as a number; None if nobody measured it.
-    """
-
-    title: str
-    command: tuple[str, ...]
-    cost: str
-    seconds: float | None
-
-    def run(self) -> None:
-        """Runs the command in a process of its own, and lets it save and end on a signal.
-
-        Raises:
-          UsageError: the command failed, or was stopped.
-        """
-        print(f"{self.title} ({self.cost}): {self.text}", flush=True)
-        process = subprocess.Popen([sys.executable, "-m", *self._module, *self.command[1:]])
-        received: list[int] = []
-
-        def stop(number: int, frame: Any) -> None:
-            received.append(number)
-            if number == signal.SIGTERM:  # Ctrl-C reaches the process by itself.
-                process.terminate()
-
-        previous = {which: signal.signal(which, stop) for which in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            status = process.wait()
-        finally:
-            for which, handler in previous.items():
-                signal.signal(which, handler)
-        if received:
-            raise UsageError("Stopped; call the same command again to go on.")
-        if status:
-            raise UsageError(f"The command ended with status {status}: {self.text}")
-
-    @property
-    def _module(self) -> tuple[str, ...]:
-        return (f"experiments.{self.command[0]}",)
-
-    @property
-    def text(self) -> str:
-        """The whole command, for a shell."""
-        return shlex.join(["python", "-m", *self._module, *self.command[1:]])
-
-
-def embed_job(source: Source, representation: str) -> Job | None:
-    """What makes a representation; None if there is nothing to make."""
-    domain = source.domain
-    is_learned = representation.startswith(("hvae", "vae"))
-    if not is_learned or representation in source.given:
-        return None
-    if (source.embed_folder(representation) / TABLE_FILE).exists():
-        return None
-    budget = domain.stage_one(parse_representation(domain, representation).play, source.stage_one)
-    command = (
-        "embed",
-        f"--task={domain.task.reference}",
-        f"--representation={representation}",
-        f"--budget={source.stage_one}",
-        f"--runs={source.folder}",
-    )
-    return Job(f"Representation {representation}", command, budget.cost, None)
-
-
-def sweep_job(source: Source, cell: Cell, seeds: Sequence[int]) -> Job:
-    """What trains a cell with some seeds."""
-    domain = source.domain
-    budget = source.budget_of(cell.method)
-    listed = ",".join(map(str, seeds))
-    name = (
-        f"sweep-{file_name(cell.method)}-{cell.representation}-{source.budget}-{budget.num_updates}"
-    )
-    folder = domain.folder(source.folder) / f"{name}-{listed.replace(',', '-')}"
-    command = (
-        "sweep",
-        f"--task={domain.task.reference}",
-        f"--split={domain.split_name}",
-        f"--method={cell.method}",
-        f"--representation={source.representation_flag(cell.representation)}",
-        f"--representation_budget={source.stage_one}",
-        f"--budget={source.budget}",
-        f"--seeds={listed}",
-        f"--runs={source.folder}",
-        f"--workdir={folder}",
-        *(f"--set={assignment}" for assignment in source.assignments),
-        f"--set=num_updates={budget.num_updates}",
-    )
-    steps = budget.num_updates * budget.ppo.steps_per_update
-    seconds = training_seconds(source, cell.method, steps * len(seeds), len(seeds))
-    title = f"{cell.method} on {cell.representation}, {len(seeds)} seeds of {steps * 1e-6:.2f} M"
-    return Job(title, command, duration(seconds), seconds)
-
-
-def training_seconds(source: Source, method: str, steps: float, num_runs: int) -> float | None:
-    """How long `steps` of training take, in all of `num_runs` runs of a sweep."""
-    measured = source.domain.task.measured
-    if measured is None:
-        return None
-    rate = measured.training.get(method, measured.training["ours"])
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    devices = max(n for n in range(1, cores + 1) if num_runs % n == 0)
-    return steps / (rate * devices)
-
-
-def evaluation_seconds(source: Source, num_episodes: float) -> float | None:
-    """How long so many episodes take."""
-    measured = source.domain.task.measured
-    return None if measured is None else num_episodes / measured.evaluation
-
-
-def duration(seconds: float | None) -> str:
-    """Seconds for reading."""
-    if seconds is None:
-        return "nobody measured how long it takes"
-    if seconds < 90:
-        return f"about {max(1, round(seconds))} s"
-    if seconds < 5400:
-        return f"about {round(seconds / 60)} minutes"
-    return f"about {seconds / 3600:.1f} hours"

@@ -152,7 +152,7 @@ def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
     if not is_bar or group.paper_method is None:
         return None
     environment = str(group.paper_environment)
-    return paper_value(environment, group.paper_method, evaluation["actions"])
+    return paper_value(environment, group.paper_method, evaluation["actions"], group.paper_figure)
 
 
 def as_csv(rows: Sequence[ResultRow]) -> str:

@@ -16,6 +16,7 @@ from experiments._artifacts import SPLIT_FILE, TABLE_FILE
 from experiments._flags import UsageError, load_task
 from experiments._paper import (
     paper_environment,
+    paper_figure_of_split,
     paper_method,
     paper_results,
     paper_set_size,
@@ -86,6 +87,11 @@ class Run:
         made = self.table.source.split(",")[0].removeprefix("engineered:") if self.table else ""
         return made if re.fullmatch(r"[\w-]+", made) else Path(given).stem
 
+    @property
+    def is_finished(self) -> bool:
+        """All its updates are done."""
+        return self.trained_steps >= self.config["num_updates"] * self.steps_per_update
+
     def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values f64[n] of an evaluated metric, e.g. `train/is_success`."""
         points = [(r["step"], r[name]) for r in self.reports if r.get(name) is not None]
@@ -125,10 +131,27 @@ class Group:
     @property
     def paper_method(self) -> str | None:
         """What the paper calls this setting; None where it has no counterpart."""
-        is_default = self.config["split"] == self.task.default_split
-        if self.paper_environment is None or not is_default or self.is_finetuned:
+        is_shown = self.is_default_split or self.paper_figure is not None
+        if self.paper_environment is None or not is_shown or self.is_ours_alone:
             return None
-        return paper_method(self.config["method"], self.representation)
+        conditioned = "conditioned_auxiliary" if self.config.get("conditions_position") else ""
+        variant = "_".join(word for word in (self.task.paper_variant, conditioned) if word)
+        return paper_method(self.config["method"], self.representation, variant)
+
+    @property
+    def is_ours_alone(self) -> bool:
+        """Trained in a way that the paper has no bars of."""
+        return self.is_finetuned or bool(self.config.get("num_clusters", 0))
+
+    @property
+    def is_default_split(self) -> bool:
+        """Trained on the split that the task takes if none is named."""
+        return bool(self.config["split"] == self.task.default_split)
+
+    @property
+    def paper_figure(self) -> str | None:
+        """Where the rows of `paper_method` stand; None for the first figure that has them."""
+        return None if self.is_default_split else paper_figure_of_split(self.config["split"])
 
     @property
     def is_finetuned(self) -> bool:

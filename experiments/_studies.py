@@ -1,9 +1,7 @@
-"""What `analyze` studies: conditions of evaluation, and grids of hyper-parameters."""
+"""Studies of trained policies: one evaluation for each value of a condition."""
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
@@ -12,10 +10,8 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.figure import Figure
 
 from experiments import _flags as flag
-from experiments import _plots as plots
 from experiments._artifacts import (
     Domain,
     collect_observations,
@@ -23,53 +19,12 @@ from experiments._artifacts import (
     parse_representation,
 )
 from experiments._evaluation import evaluate_on, record
-from experiments._methods import file_name
-from experiments._paper import paper_value
-from experiments._plots import Metric
-from experiments._production import Job, Source, duration, training_seconds
-from experiments._runs import Group, group_runs, read_runs
+from experiments._paper import PaperValue, paper_method, paper_results
+from experiments._runs import Group, Run, group_runs, read_runs
+from experiments._study_report import Study, StudyPoint
 from experiments._training import Trainer, load_state, load_trainer
 from jaxnew.actions import ActionSplit, mixture_ids
 from jaxnew.task import Task
-
-
-@dataclass(frozen=True)
-class StudyPoint:
-    """One condition of one setting.
-
-    Attributes:
-      setting: label of the runs, which differ in their seed only.
-      x: place on the horizontal axis.
-      means: f64[n] of each seed.
-      num_episodes: per seed; 0 for the best evaluation during training.
-      paper: the paper's mean, or None.
-    """
-
-    setting: str
-    x: float
-    means: np.ndarray
-    num_episodes: int
-    paper: float | None = None
-
-
-@dataclass(frozen=True)
-class Study:
-    """Points, and what they are.
-
-    Attributes:
-      name: of the study.
-      axis: what `StudyPoint.x` is.
-      has_log_axis: whether it is drawn on a logarithmic scale.
-      metric: how the means are shown.
-      note: below the table.
-    """
-
-    name: str
-    axis: str
-    has_log_axis: bool
-    metric: Metric
-    points: tuple[StudyPoint, ...]
-    note: str
 
 
 @dataclass(frozen=True)
@@ -126,7 +81,8 @@ class _Kind:
       values: of the axis.
       condition: what a value means.
       note: below the table.
-      paper_method: see `ActionStudy`.
+      paper_method: `(paper's name of the setting, value) ->` the paper's name of the point.
+      figure: see `ActionStudy`.
     """
 
     axis: str
@@ -134,7 +90,8 @@ class _Kind:
     condition: Callable[[Context, float], Condition]
     note: str
     has_log_axis: bool = False
-    paper_method: Callable[[float], str] | None = None
+    paper_method: Callable[[str, float], str] | None = None
+    figure: str = ""
 
 
 def _sizes(task: Task) -> list[float]:
@@ -150,7 +107,11 @@ def _first_sizes(task: Task) -> list[float]:
 
 STUDIES = {
     "set-size": _Kind(
-        "actions in a test set", _sizes, _set_size, "Test actions (experiments spec 17)."
+        "actions in a test set",
+        _sizes,
+        _set_size,
+        "Test actions (experiments spec 17).",
+        paper_method=lambda name, value: f"{name}[test_set_size={value:g}]",
     ),
     "unseen-ratio": _Kind(
         "share of unseen actions in the pool",
@@ -194,16 +155,40 @@ def _kind_of(name: str, task: Task) -> _Kind:
         ids = study.ids(np.asarray(trainer.table), value)
         return Condition(f"{name}-{value:g}", ids, {"set_size": size})
 
+    published = study.paper_method
     return _Kind(
-        study.axis, lambda task: study.values, condition, study.note, False, study.paper_method
+        study.axis,
+        lambda task: study.values,
+        condition,
+        study.note,
+        # The rows of an analysis are those of its own policy, whatever the default's are called.
+        paper_method=published and (lambda name, value: published(value)),
+        figure=study.figure,
     )
 
 
-def _paper_mean(kind: _Kind, group: Group, value: float) -> float | None:
-    if kind.paper_method is None or group.paper_environment is None:
+def paper_point(kind: _Kind, group: Group, value: float) -> PaperValue | None:
+    """The paper's point beside one of ours; None where it has none for the setting or the value."""
+    name = _analysed(group) if kind.figure else group.paper_method
+    if kind.paper_method is None or name is None or not group.is_default_split:
         return None
-    found = paper_value(group.paper_environment, kind.paper_method(value), "test")
-    return None if found is None else found.mean
+    wanted = kind.paper_method(name, value)
+    for row in paper_results(str(group.paper_environment)):
+        if (row.method, row.split) == (wanted, "test"):
+            return PaperValue(row.mean, row.std, row.num_seeds)
+    return None
+
+
+def _analysed(group: Group) -> str | None:
+    """`ours` for the one setting of the paper's analyses; their encoder had seen the whole universe
+    (spec method 10), which is an oracle's.
+    """
+    if group.paper_environment is None or group.is_ours_alone:
+        return None
+    if group.config.get("conditions_position", False):
+        return None
+    name = paper_method(group.config["method"], group.representation.removesuffix("-oracle"))
+    return name if name == "ours" else None
 
 
 def study_runs(
@@ -212,8 +197,17 @@ def study_runs(
     values: Sequence[float],
     num_episodes: int,
     encoder: Path | None = None,
+    num_workers: int = 0,
 ) -> Study:
     """Evaluates runs under every condition of a study; what is there already is read.
+
+    Args:
+      name: of the study.
+      paths: the runs.
+      values: of the axis; none for the study's own.
+      num_episodes: of each evaluation.
+      encoder: run of `embed`, for the study of recordings.
+      num_workers: processes for environments on the host; 0: one per core.
 
     Raises:
       UsageError: no runs, or not those that the study needs.
@@ -226,25 +220,55 @@ def study_runs(
     axis = [float(value) for value in values or kind.values(groups[0].task)]
     points = []
     for group in groups:
-        by_run = [_evaluations(run.path, kind, axis, num_episodes, encoder) for run in group.runs]
+        by_run = [
+            _evaluations(run.path, kind, axis, num_episodes, encoder, num_workers)
+            for run in group.runs
+        ]
         metric = group.task.selection_metric
         for index, value in enumerate(axis):
             means = np.array([rows[index]["metrics"][metric]["mean"] for rows in by_run])
             fewest = min(rows[index]["num_episodes"] for rows in by_run)
-            paper = _paper_mean(kind, group, value)
+            paper = paper_point(kind, group, value)
             points.append(StudyPoint(group.label, value, means, fewest, paper))
-    return Study(name, kind.axis, kind.has_log_axis, groups[0].metric, tuple(points), kind.note)
+    return Study(
+        name,
+        kind.axis,
+        kind.has_log_axis,
+        groups[0].metric,
+        tuple(points),
+        kind.note,
+        kind.figure,
+        groups[0].paper_environment or groups[0].task.name,
+    )
+
+
+def lacking_values(name: str, run: Run, task: Task, num_episodes: int) -> list[float]:
+    """Values of one of the task's own studies for which a run still must be evaluated."""
+    wanted = {"set_size": run.config["ppo"]["rollout"]["set_size"]}
+    return [
+        value
+        for value in _kind_of(name, task).values(task)
+        if not any(
+            _is(e, Condition(f"{name}-{value:g}", np.zeros(0, np.int32), wanted), num_episodes)
+            for e in run.evaluations
+        )
+    ]
 
 
 def _evaluations(
-    path: Path, kind: _Kind, axis: Sequence[float], num_episodes: int, encoder: Path | None
+    path: Path,
+    kind: _Kind,
+    axis: Sequence[float],
+    num_episodes: int,
+    encoder: Path | None,
+    num_workers: int,
 ) -> list[dict[str, Any]]:
     """The evaluation of one run under each condition."""
-    run, trainer, split = load_trainer(path)
-    state, step = load_state(run, trainer, "best")
+    run, trainer, split = load_trainer(path, num_workers)
     (known,) = read_runs([path])
     rows = []
     with closing(trainer):
+        state, step = load_state(run, trainer, "best")
         for value in axis:
             condition = kind.condition((trainer, split, encoder), value)
             found = [e for e in known.evaluations if _is(e, condition, num_episodes)]
@@ -305,180 +329,3 @@ def encoded_test_actions(encoder: Path, split: ActionSplit, num_recordings: int)
         )
     recordings = collect_observations(domain, encoder.parent.parent, available, play)
     return learner.encode(state, recordings.for_encoding(split.test, num_recordings))
-
-
-# ---- Search grids ----
-
-# Values searched by the paper (appendix, "Hyperparameter Search").
-GRIDS: dict[str, tuple[float, ...]] = {
-    "entropy": (0.0001, 0.001, 0.005, 0.01, 0.05, 0.1),
-    "batch-size": (1024, 2048, 3072, 4096),
-}
-
-
-def search(name: str, seeds: Sequence[int], steps: float, values: Sequence[float]) -> Study:
-    """Trains every value of a grid with every seed; the best by validation is named.
-
-    The entropy coefficient is traced, so that all values are one program; a batch size is a shape,
-    so that every value is a program of its own.
-    """
-    task = flag.load_task(flag.TASK.value)
-    domain = Domain.of(task, flag.SPLIT.value)
-    source = Source(
-        domain=domain,
-        folder=Path(flag.RUNS.value),
-        budget=flag.BUDGET.value,
-        stage_one=flag.BUDGET.value,
-        steps=steps,
-        seeds=tuple(seeds),
-        assignments=tuple(flag.SET.value),
-        given={},
-    )
-    grid = tuple(values or GRIDS[name])
-    make = _entropy_groups if name == "entropy" else _batch_size_groups
-    groups = make(source, grid)
-    points = [
-        StudyPoint(group.label.split(",")[0], value, best_validations(group), 0)
-        for value, group in groups
-    ]
-    best = max(points, key=lambda point: float(point.means.mean()))
-    axis = {"entropy": "entropy coefficient", "batch-size": "transitions per minibatch"}[name]
-    note = (
-        f"Best evaluation on validation sets during training, mean over {len(seeds)} seeds. Chosen "
-        f"by it: {axis} {best.x:g}."
-    )
-    return Study(name, axis, name == "entropy", groups[0][1].metric, tuple(points), note)
-
-
-def best_validations(group: Group) -> np.ndarray:
-    """f64[n] the best value on validation sets of each run."""
-    name = f"validation/{group.task.selection_metric}"
-    return np.array([run.curve(name)[1].max() for run in group.runs])
-
-
-def _entropy_groups(source: Source, grid: Sequence[float]) -> list[tuple[float, Group]]:
-    listed = ",".join(f"{value:g}" for value in grid)
-    groups = _searched(source, "entropy", len(grid), f"--vary=entropy_coefficient={listed}")
-    return [(g.config["hyperparameters"]["entropy_coefficient"], g) for g in groups]
-
-
-def _batch_size_groups(source: Source, grid: Sequence[float]) -> list[tuple[float, Group]]:
-    """Longer rollouts make larger minibatches; environment steps stay the same."""
-    preset = source.budget_of(flag.METHOD.value)
-    steps = source.steps or float(preset.num_updates * preset.ppo.steps_per_update)
-    num_envs = preset.ppo.rollout.num_envs
-    found = []
-    for value in grid:
-        num_steps, rest = divmod(int(value) * preset.ppo.num_minibatches, num_envs)
-        if rest or not num_steps:
-            raise flag.UsageError(
-                f"Minibatches of {value:g} are no whole number of steps: a rollout of {num_envs} "
-                f"environments is cut into {preset.ppo.num_minibatches}."
-            )
-        assignments = (*source.assignments, f"ppo.rollout.num_steps={num_steps}")
-        own = replace(source, steps=steps, assignments=assignments)
-        (group,) = _searched(own, f"batch-size-{value:g}", 1)
-        found.append((value, group))
-    return found
-
-
-def _searched(source: Source, name: str, num_values: int, *options: str) -> list[Group]:
-    """The groups of one search program, trained now unless it is there."""
-    method, representation = flag.METHOD.value, flag.REPRESENTATION.value
-    budget = source.budget_of(method)
-    listed = ",".join(map(str, source.seeds))
-    stem = f"search-{name}-{file_name(method)}-{Path(representation).stem}-{source.budget}"
-    digits = f"{budget.num_updates}-{listed.replace(',', '-')}"
-    folder = source.domain.folder(source.folder) / f"{stem}-{digits}"
-    command = (
-        "sweep",
-        f"--task={flag.TASK.value}",
-        f"--split={source.domain.split_name}",
-        f"--method={method}",
-        f"--representation={representation}",
-        f"--budget={source.budget}",
-        f"--seeds={listed}",
-        f"--runs={source.folder}",
-        f"--workdir={folder}",
-        *options,
-        *(f"--set={assignment}" for assignment in source.assignments),
-        f"--set=num_updates={budget.num_updates}",
-    )
-    num_runs = num_values * len(source.seeds)
-    steps = num_runs * budget.num_updates * budget.ppo.steps_per_update
-    seconds = training_seconds(source, method, steps, num_runs)
-    if not (folder / "members").exists():
-        Job(f"{num_runs} runs in one program", command, duration(seconds), seconds).run()
-    if not (folder / "members").exists():
-        raise flag.UsageError(f"{folder} is not finished; call the same command again to go on.")
-    return group_runs(read_runs([folder]))
-
-
-# ---- Tables and pictures ----
-
-
-def as_csv(study: Study) -> str:
-    """One line per setting, value and seed."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(
-        ["study", "setting", study.axis, "mean", "std", "num_seeds", "num_episodes", "paper"]
-    )
-    for point in study.points:
-        numbers = [float(point.means.mean()), float(point.means.std()), len(point.means)]
-        paper = "" if point.paper is None else point.paper
-        writer.writerow([study.name, point.setting, point.x, *numbers, point.num_episodes, paper])
-    return text.getvalue()
-
-
-def as_markdown(study: Study) -> str:
-    """A row per value, a column per setting."""
-    settings = list(dict.fromkeys(point.setting for point in study.points))
-    lines = [f"# {study.name}: {study.metric.name.lower()}", ""]
-    has_paper = any(point.paper is not None for point in study.points)
-    headings = [study.axis, *settings, *(["paper"] if has_paper else [])]
-    lines.append("| " + " | ".join(headings) + " |")
-    lines.append("|" + " --- |" * len(headings))
-    for x in dict.fromkeys(point.x for point in study.points):
-        cells = [f"{x:g}"]
-        for setting in settings:
-            (point,) = [p for p in study.points if (p.x, p.setting) == (x, setting)]
-            mean, std = study.metric.text(point.means.mean()), study.metric.text(point.means.std())
-            cells.append(f"{mean} ± {std}" if len(point.means) > 1 else mean)
-        if has_paper:
-            papers = [p.paper for p in study.points if p.x == x and p.paper is not None]
-            cells.append(study.metric.text(papers[0]) if papers else "-")
-        lines.append("| " + " | ".join(cells) + " |")
-    seeds = sorted({len(point.means) for point in study.points})
-    episodes = sorted({point.num_episodes for point in study.points})
-    of_each = f", {episodes[0]:,} episodes each" if episodes[0] else ""
-    lines += ["", f"{study.note} Seeds: {', '.join(map(str, seeds))}{of_each}; ± is the population"]
-    lines[-1] += " standard deviation over seeds."
-    return "\n".join(lines) + "\n"
-
-
-def study_figure(study: Study) -> Figure:
-    """Mean and deviation over seeds against the axis, a line per setting."""
-    figure = plots.new_figure(5.4, 4.0)
-    axes = figure.subplots()
-    settings = list(dict.fromkeys(point.setting for point in study.points))
-    for color, setting in zip(plots.hls_palette(len(settings)), settings, strict=True):
-        points = sorted((p for p in study.points if p.setting == setting), key=lambda p: p.x)
-        y = study.metric.scale * np.array([point.means.mean() for point in points])
-        error = study.metric.scale * np.array([point.means.std() for point in points])
-        x = [point.x for point in points]
-        axes.errorbar(x, y, yerr=error, color=color, marker="o", capsize=2.5, label=setting)
-    published = sorted({(p.x, p.paper) for p in study.points if p.paper is not None})
-    if published:
-        places, means = np.array(published).T
-        scaled = study.metric.scale * means
-        axes.plot(places, scaled, color=plots.INK, linestyle="--", marker=".", label="paper")
-    if study.has_log_axis:
-        axes.set_xscale("log")
-    axes.set_ylim(0.0, None)
-    axes.set_xlabel(study.axis.capitalize(), fontsize=9, color=plots.INK)
-    axes.set_ylabel(study.metric.name, fontsize=9, color=plots.INK)
-    plots.tidy(axes)
-    figure.legend(loc="outside lower center", ncols=2, **plots.LEGEND)
-    plots.set_title(figure, study.name.replace("-", " ").capitalize())
-    return figure

@@ -7,9 +7,11 @@
     python -m experiments.analyze --study=entropy --representation=gt12 --budget=paper
     python -m experiments.analyze --study=batch-size --representation=gt12 --budget=paper
 
-The first four evaluate the best checkpoints of runs (a sweep stands for its members) and train
-nothing; the last two train every value of the paper's grid with several seeds, and choose by
-validation (paper appendix D, "Hyperparameter Search"). What is done already is not done again.
+The first four, and a task's own studies (figures 9a to 9c: `angle`, `embedding` and `mix` of runs
+of `create-push-analysis`), evaluate the best checkpoints of runs (a sweep stands for its members)
+and train nothing; the last two train every value of the paper's grid with several seeds, and choose
+by validation (paper appendix D, "Hyperparameter Search"), after a list of the commands with the
+time that they take (`--dry_run`: the list only). What is done already is not done again.
 """
 
 from __future__ import annotations
@@ -19,17 +21,9 @@ from pathlib import Path
 from absl import flags
 
 from experiments import _flags as flag
-from experiments import _plots as plots
-from experiments._studies import (
-    GRIDS,
-    STUDIES,
-    Study,
-    as_csv,
-    as_markdown,
-    search,
-    study_figure,
-    study_runs,
-)
+from experiments._searches import GRIDS, search
+from experiments._studies import STUDIES, study_runs
+from experiments._study_report import Study, write_study
 
 STUDY = flags.DEFINE_string(
     "study", None, f"What to study: {', '.join([*STUDIES, *GRIDS])}, or one of the task's own."
@@ -40,6 +34,10 @@ VALUES = flags.DEFINE_list("values", [], "Values of the horizontal axis; default
 EPISODES = flags.DEFINE_integer("episodes", 5000, "Episodes of each evaluation.")
 SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71", "81"], "Seeds of a search.")
 STEPS = flags.DEFINE_float("steps", 0.0, "Environment steps of a search's runs; 0: of --budget.")
+DRY_RUN = flags.DEFINE_bool("dry_run", False, "Of a search, only say what is missing.")
+REPRESENTATION_BUDGET = flags.DEFINE_string(
+    "representation_budget", None, "Budget of a search's representation; default: --budget."
+)
 OUT = flags.DEFINE_string("out", None, "Where to write; default: `analysis/` beside the runs.")
 
 
@@ -47,33 +45,27 @@ def main() -> None:
     if STUDY.value is None:
         raise flag.UsageError(f"Say which: --study={'|'.join([*STUDIES, *GRIDS])}.")
     if STUDY.value in GRIDS:
-        study = search(
+        searched = search(
             STUDY.value,
             [int(seed) for seed in SEEDS.value],
             STEPS.value,
             [float(value) for value in VALUES.value],
+            REPRESENTATION_BUDGET.value,
+            DRY_RUN.value,
         )
+        if searched is None:
+            return
+        study: Study = searched
         folder = Path(flag.RUNS.value) / flag.load_task(flag.TASK.value).name
     else:
         paths = [Path(path) for path in RUN.value]
         encoder = Path(ENCODER.value) if ENCODER.value else None
         values = [float(value) for value in VALUES.value]
-        study = study_runs(STUDY.value, paths, values, EPISODES.value, encoder)
+        study = study_runs(STUDY.value, paths, values, EPISODES.value, encoder, flag.WORKERS.value)
         folder = paths[0].parent
-    for file in write(study, Path(OUT.value) if OUT.value else folder / "analysis"):
+    out = Path(OUT.value) if OUT.value else folder / "analysis"
+    for file in write_study(study, out, study.name.replace("-", "_")):
         print(file)
-
-
-def write(study: Study, out: Path) -> list[Path]:
-    """The study as a picture and as two tables."""
-    name = study.name.replace("-", "_")
-    out.mkdir(parents=True, exist_ok=True)
-    text = as_markdown(study)
-    print(text)
-    (out / f"{name}.md").write_text(text, encoding="utf-8")
-    (out / f"{name}.csv").write_text(as_csv(study), encoding="utf-8")
-    figures = plots.save(study_figure(study), out / f"{name}.png")
-    return [*figures, out / f"{name}.md", out / f"{name}.csv"]
 
 
 if __name__ == "__main__":

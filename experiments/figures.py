@@ -2,6 +2,7 @@
 
     python -m experiments.figures --run=RUN,RUN,RUN --out=DIRECTORY
     python -m experiments.figures --figure=4,6,24 --task=grid_world --budget=paper
+    python -m experiments.figures --figure=8 --task=create-push --run=RUN
 
 With `--run`, whatever the directories hold is drawn; nothing is trained or evaluated. Runs that
 differ in their seed only are drawn as one setting; a sweep stands for its members, and a run of
@@ -9,7 +10,10 @@ differ in their seed only are drawn as one setting; a sweep stands for its membe
 
 With `--figure`, the runs that a figure of the paper needs are looked for below `--runs`. Those that
 are missing are made, after a list of them with the time that they take (`--dry_run`: the list
-only); stopped and called again, it goes on where it was.
+only); stopped and called again, it goes on where it was. Runs of domains inside jit are made by
+`sweep`, all seeds in one program, those of domains on the host by `train`, one after the other.
+
+Figure 8 are films of zero-shot episodes, of a run that is given or else of the first seed's.
 """
 
 from __future__ import annotations
@@ -50,6 +54,10 @@ def define_flags() -> None:
 
 def main() -> None:
     values = flags.FLAGS
+    if values.figure == ["8"] and values.run:
+        for file in _paper_figures.film_given(values):
+            print(file)
+        return
     if values.figure and values.run:
         raise flag.UsageError("Give --run, to draw these runs, or --figure, to find and make them.")
     if values.figure:

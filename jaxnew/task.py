@@ -6,7 +6,7 @@ import os
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -158,6 +158,7 @@ class ActionStudy:
       ids: `(table f32[A, d], value) -> int32[n]` actions that sets are drawn from.
       note: the rule, for readers of the table.
       paper_method: `value ->` name of the row in the paper's results, or None if it has none.
+      figure: number of the paper's figure, or empty.
     """
 
     axis: str
@@ -165,6 +166,7 @@ class ActionStudy:
     ids: Callable[[np.ndarray, float], np.ndarray]
     note: str
     paper_method: Callable[[float], str] | None = None
+    figure: str = ""
 
 
 @dataclass(frozen=True)
@@ -178,6 +180,32 @@ class Measured:
 
     training: Mapping[str, float]
     evaluation: float
+
+
+class Film(NamedTuple):
+    """An episode to look at.
+
+    Attributes:
+      frames: uint8[height, width, 3] each, all of one size; the last one shows the end.
+      metrics: of the pool's `episode_metrics`, at the end.
+    """
+
+    frames: list[np.ndarray]
+    metrics: Mapping[str, float]
+
+
+class MakeFilm(Protocol):
+    """Plays an episode of a pool again, from its seed and the T actions that it was told.
+
+    Args:
+      seed: of the episode, see `jaxnew.rollout.pool.HostPool`.
+      ids, positions: int32[T] and f32[T, k].
+      size: pixels of the frames' height.
+    """
+
+    def __call__(
+        self, seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, *, size: int
+    ) -> Film: ...
 
 
 @dataclass(frozen=True)
@@ -195,6 +223,7 @@ class HostDomain:
       stack_size: frames in a stack.
       pool_settings: frozen dataclass, how workers are run; `--set=pool.FIELD=value` changes it.
         None: there is nothing to set.
+      make_film: an episode to look at, or None where it cannot be drawn; see `MakeFilm`.
 
     Raises:
       ValueError: the actions have a stop bit.
@@ -206,6 +235,7 @@ class HostDomain:
     max_episode_steps: int
     stack_size: int = 1
     pool_settings: Any = None
+    make_film: MakeFilm | None = None
 
     def __post_init__(self) -> None:
         if self.action_spec.has_stop:
@@ -269,6 +299,8 @@ class Task:
       baselines: settings of the paper's baselines.
       measured: speeds, or None where nobody measured them.
       paper_environment: name of the domain in the paper's results, or None.
+      paper_variant: what the paper's results append to the names of methods for this variant of the
+        domain, such as `no_subgoal_reward`; empty for the domain itself.
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
       studies: what `analyze` offers for this task beside what it offers for every one.
@@ -299,6 +331,7 @@ class Task:
     baselines: Baselines = field(default_factory=Baselines)
     measured: Measured | None = None
     paper_environment: str | None = None
+    paper_variant: str = ""
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
     studies: Mapping[str, ActionStudy] = field(default_factory=dict)
     actions_name: str | None = None

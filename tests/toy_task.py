@@ -11,7 +11,7 @@ from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import HostDomain, LoopConfig, StageTwoBudget, Task
+from jaxnew.task import ActionStudy, Film, HostDomain, LoopConfig, StageTwoBudget, Task
 from tests import toy_host
 
 A, NO_OP = toy_host.NUM_ACTIONS, toy_host.NUM_ACTIONS - 1
@@ -49,6 +49,29 @@ def make_pool(**arguments: Any) -> toy_host.ToyPool:
     return toy_host.ToyPool(**arguments)
 
 
+def make_film(
+    seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, *, size: int
+) -> Film:
+    """The frames of an episode in red, and a last one that is green after a success."""
+    env = toy_host.ToyEnv()
+    scale = size // toy_host.SIZE
+    frames = [env.reset(seed)]
+    for action_id, position in zip(ids, positions, strict=True):
+        frame, _, _, _, metrics = env.step(int(action_id), position)
+        frames.append(frame)
+    colored = np.zeros((len(frames) + 1, size, size, 3), np.uint8)
+    colored[:-1, ..., 0] = np.kron(frames, np.ones((1, scale, scale)))
+    colored[-1, ..., 1] = 255 * int(metrics["is_success"])
+    return Film(list(colored), metrics)
+
+
+def even_share(table: np.ndarray, share: float) -> np.ndarray:
+    """Eight actions, so large a share of which are good."""
+    good = np.arange(0, NO_OP, 2)[: round(8 * share)]
+    bad = np.arange(1, NO_OP, 2)[: 8 - len(good)]
+    return np.sort(np.concatenate([good, bad])).astype(np.int32)
+
+
 _SMOKE = StageTwoBudget(
     num_updates=4,
     ppo=PPOConfig(
@@ -80,6 +103,17 @@ TASK = Task(
         observation_spec=ObservationSpec((toy_host.SIZE, toy_host.SIZE), np.uint8, 0, 255),
         max_episode_steps=toy_host.MAX_STEPS,
         stack_size=3,
+        make_film=make_film,
     ),
     stage_two={"smoke": _SMOKE, "longer": replace(_SMOKE, num_updates=40)},
+    studies={
+        "goodness": ActionStudy(
+            "share of good actions",
+            (0.0, 0.5, 1.0),
+            even_share,
+            "Good actions are worth something.",
+            lambda value: f"ours_analysis[unseen_fraction={value:.1f}]",
+            figure="9c",
+        )
+    },
 )

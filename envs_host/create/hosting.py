@@ -62,8 +62,7 @@ class CreateHost:
 
     def reset(self, seed: np.random.SeedSequence) -> np.ndarray:
         """Starts an episode; returns its first frame uint8[84, 84]."""
-        # 64 bits, so that no two of a run's episodes share a layout by chance.
-        observation, _ = self.env.reset(seed=int(seed.generate_state(1, np.uint64)[0]))
+        observation, _ = self.env.reset(seed=_bits(seed))
         return observation
 
     def step(self, action_id: int, position: np.ndarray) -> Step:
@@ -71,8 +70,33 @@ class CreateHost:
         observation, reward, terminated, truncated, _ = self.env.step(
             {"index": action_id, "position": position}
         )
+        return Step(observation, reward, terminated, truncated, self._metrics())
+
+    def film(
+        self, seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, size: int
+    ) -> tuple[list[np.ndarray], Mapping[str, float]]:
+        """Plays an episode again, for people.
+
+        Args:
+          seed: with which the episode was reset.
+          ids, positions: int[T] and f32[T, 2], what its steps were told.
+          size: pixels of the side.
+
+        Returns:
+          The frames of `films.episode_frames`, and the metrics after the last step.
+        """
+        # Imported late: pictures for people are no business of worker processes.
+        from envs_host.create.films import episode_frames
+        from envs_host.create.illustration import RenderOptions
+
+        actions = [{"index": int(i), "position": p} for i, p in zip(ids, positions, strict=True)]
+        options = RenderOptions(size=size)
+        frames = list(episode_frames(self.env, _bits(seed), actions, options))
+        return frames, self._metrics()
+
+    def _metrics(self) -> Mapping[str, float]:
         summary = self.env.episode.summary
-        metrics = {
+        return {
             "is_success": float(summary.goal_hit),
             "target_hit": float(summary.target_hit),
             "episode_return": summary.reward,
@@ -82,7 +106,11 @@ class CreateHost:
             "num_blocked": float(summary.num_blocked),
             "num_no_op": float(summary.num_no_op),
         }
-        return Step(observation, reward, terminated, truncated, metrics)
 
     def close(self) -> None:
         self.env.close()
+
+
+def _bits(seed: np.random.SeedSequence) -> int:
+    """A seed of 64 bits, so that no two of a run's episodes share a layout by chance."""
+    return int(seed.generate_state(1, np.uint64)[0])

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from envs_host.create.hosting import CreateHost
 from envs_host.create.levels import load_level
 from envs_host.create.play import NUM_STATES, STATE_SIZE
 from envs_host.create.recorder import PoolRecorder
@@ -41,6 +42,7 @@ from jaxnew.rollout.device import RolloutConfig
 from jaxnew.task import (
     ActionStudy,
     Baselines,
+    Film,
     HostDomain,
     LoopConfig,
     Play,
@@ -214,6 +216,17 @@ def _make_pool(
     )
 
 
+def _make_film(
+    kwargs: dict[str, Any],
+    seed: np.random.SeedSequence,
+    ids: np.ndarray,
+    positions: np.ndarray,
+    *,
+    size: int,
+) -> Film:
+    return Film(*CreateHost(**kwargs).film(seed, ids, positions, size))
+
+
 _STUDIES = {
     "angle": ActionStudy(
         "least angle to a training tool (degrees)",
@@ -222,6 +235,7 @@ _STUDIES = {
         "Tools at least so far from every angle of training tools, all classes pooled and without "
         "wrap-around (figure 9a, the release's rule; spec create 4.4).",
         lambda value: f"ours_analysis[min_angle_deg={value:g}]",
+        figure="9a",
     ),
     "angle-per-class": ActionStudy(
         "least angle to a training tool of the class (degrees)",
@@ -236,6 +250,7 @@ _STUDIES = {
         "Tools whose representation is at least so far from that of every training tool (figure "
         "9b; the release compared squared distances, spec create A18).",
         lambda value: f"ours_analysis[min_sq_emb_dist={value:.1f}]",
+        figure="9b",
     ),
     "mix": ActionStudy(
         "share of unseen tools",
@@ -243,6 +258,7 @@ _STUDIES = {
         lambda table, value: mix_ids(table, value, _MIX_SEED),
         "Pools with so large a share of tools at a squared distance above 3 (figure 9c).",
         lambda value: f"ours_analysis[unseen_fraction={value:.1f}]",
+        figure="9c",
     ),
 }
 
@@ -264,6 +280,10 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
     }
     suffix = ("" if with_subgoals else "-no-subgoals") + ("-analysis" if is_analysis else "")
     splits = {"default": _analysis} if is_analysis else _SPLITS
+    studies = _STUDIES
+    if not with_subgoals:  # The paper's analyses had them.
+        studies = {name: replace(study, paper_method=None) for name, study in _STUDIES.items()}
+    variants = ([] if with_subgoals else ["no_subgoal_reward"]) + is_analysis * ["analysis"]
     return Task(
         name=f"create-{definition.name.lower()}{suffix}",
         make_universe=partial(tool_universe, spacing),
@@ -275,6 +295,7 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             max_episode_steps=definition.step_limit + 1,
             stack_size=3,
             pool_settings=PoolSettings(),
+            make_film=partial(_make_film, kwargs),
         ),
         play=_PLAY[spacing],
         more_plays=(_VIDEO_PLAY[spacing],),
@@ -286,7 +307,8 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             continuous_rollout_share=2 / 3, fixed_set_minibatches=6, finetune_share=1 / 6
         ),
         paper_environment=f"CREATE {definition.name}",
-        studies=_STUDIES if is_analysis else {},
+        paper_variant="_".join(variants),
+        studies=studies if is_analysis else {},
         actions_name="create-analysis" if is_analysis else "create",
     )
 

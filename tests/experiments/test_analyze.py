@@ -15,15 +15,9 @@ import pytest
 from experiments._artifacts import load_encoder
 from experiments._flags import UsageError
 from experiments._plots import Metric
-from experiments._studies import (
-    STUDIES,
-    Study,
-    StudyPoint,
-    _batch_size_groups,
-    as_markdown,
-    encoded_test_actions,
-    study_figure,
-)
+from experiments._searches import batch_size_sources
+from experiments._studies import STUDIES, encoded_test_actions
+from experiments._study_report import Study, StudyPoint, as_markdown, study_figure
 from experiments._training import load_trainer
 from experiments.tasks.grid_world import TASK
 from jaxnew import observations
@@ -122,7 +116,7 @@ def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> Non
 def test_a_grid_is_searched_by_validation(tmp_path: Path) -> None:
     common = ("--representation=gt12", "--budget=smoke", "--seeds=1,2", f"--runs={tmp_path}")
     output = run("analyze", "--study=entropy", "--values=0.01,0.1", *common)
-    assert "4 runs in one program" in output
+    assert "4 runs of 1.02 k steps in one program" in output
     rows = rows_of(tmp_path / "grid_world" / "analysis" / "entropy.csv")
     assert [row["entropy coefficient"] for row in rows] == ["0.01", "0.1"]
     assert [row["num_seeds"] for row in rows] == ["2", "2"]
@@ -138,14 +132,8 @@ def test_a_grid_is_searched_by_validation(tmp_path: Path) -> None:
 
 @pytest.mark.unit
 def test_a_minibatch_that_is_no_whole_number_of_steps_is_refused(tmp_path: Path) -> None:
-    from absl import flags
-
-    from experiments import _flags  # noqa: F401  Defines --method.
-
-    if not flags.FLAGS.is_parsed():
-        flags.FLAGS(["test"])
     with pytest.raises(UsageError, match="Minibatches of 3 are no whole number of steps"):
-        _batch_size_groups(source_at(tmp_path), [3.0])
+        batch_size_sources(source_at(tmp_path), "ours", [3.0])
 
 
 @pytest.mark.unit

@@ -56,7 +56,7 @@ def test_the_first_figure_counts_unless_one_is_named() -> None:
 def test_all_rows_are_read() -> None:
     environments = paper_environments()
     assert len(environments) == 16
-    assert sum(len(paper_results(name)) for name in environments) == 382
+    assert sum(len(paper_results(name)) for name in environments) == 384
     assert {row.metric for row in paper_results("Recommender")} == {"ctr"}
     assert {row.metric for row in paper_results("Shape Stacking")} == {"final_height"}
     assert {row.metric for row in paper_results("Grid World")} == {"success_rate"}

@@ -17,14 +17,16 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import skill_universe
-from experiments import _finetuning, _production
+from experiments import _finetuning, _jobs
 from experiments._artifacts import Domain
 from experiments._comparison import compare_curves, comparison_markdown, verdict_of
+from experiments._figure_list import number_of
 from experiments._finetuning import finetune_budget, finetune_folder, make_finetuned
 from experiments._flags import UsageError
+from experiments._jobs import Job, duration, sweep_job
 from experiments._paper import paper_curve, paper_set_size, paper_value
-from experiments._paper_figures import FIGURES, figure_of, lacking_splits, parse_given
-from experiments._production import Cell, Job, Source, duration, find, sweep_job
+from experiments._paper_figures import lacking_splits, parse_given
+from experiments._production import Cell, Source, find
 from experiments._results import result_rows
 from experiments._runs import read_runs
 from experiments.tasks.grid_world import TASK
@@ -120,18 +122,19 @@ def test_what_is_missing_becomes_a_command_with_its_duration(tmp_path: Path) -> 
 
 @pytest.mark.unit
 def test_a_command_that_fails_ends_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_production.sys, "executable", "/bin/false")
+    monkeypatch.setattr(_jobs.sys, "executable", "/bin/false")
     with pytest.raises(UsageError, match="ended with status 1: python -m"):
         Job("it", ("sweep", "--x"), "seconds", None).run()
 
 
 @pytest.mark.unit
 def test_figures_that_do_not_exist_are_named(tmp_path: Path) -> None:
-    assert figure_of("10", "grid_world") is FIGURES["19"]
-    with pytest.raises(UsageError, match=r"No figure '5'; choose of 4, 6, 7b"):
-        figure_of("5", "grid_world")
+    assert number_of("10", "grid_world") == "19"
+    assert number_of("19", "create-push") == "10"
+    with pytest.raises(UsageError, match=r"No figure '3'; choose of 4, 5, 6, 7a"):
+        number_of("3", "grid_world")
     with pytest.raises(UsageError, match="Figure 7b does not show recommender; it shows grid_wo"):
-        figure_of("7b", "recommender")
+        number_of("7b", "recommender")
     with pytest.raises(UsageError, match="must be NAME=PATH"):
         parse_given([f"hvae={tmp_path / 'absent.npz'}"])
     with pytest.raises(UsageError, match="must be NAME=PATH"):
@@ -287,7 +290,8 @@ def test_a_figure_is_made_stopped_and_finished(tmp_path: Path) -> None:
     assert process.returncode != 0, output
     stamp = (first / "metrics.jsonl").stat().st_mtime_ns
 
-    files = [Path(line) for line in commands.run(*flags).splitlines() if "/figures/" in line]
+    place = str(folder / "figures")
+    files = [Path(line) for line in commands.run(*flags).splitlines() if line.startswith(place)]
     assert [file.name for file in files] == ["figure_6.png", "figure_6.md", "figure_6.csv"]
     assert (first / "metrics.jsonl").stat().st_mtime_ns == stamp
     with (folder / "figures" / "figure_6.csv").open() as file:

@@ -9,8 +9,9 @@ import pytest
 
 from experiments._artifacts import Domain
 from experiments._flags import UsageError, load_task
+from experiments._jobs import embed_job, sweep_job
 from experiments._methods import adapted, file_name, method_of, variant_of
-from experiments._production import Cell, Source, embed_job, sweep_job
+from experiments._production import Cell, Source
 from jaxnew.policy import UtilityMethod
 
 pytestmark = pytest.mark.unit

@@ -1,0 +1,178 @@
+"""The figures of the paper: which settings each of them shows, by task (experiments spec 2)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+from experiments import _flags as flag
+from experiments._production import Cell
+
+_BASELINES = ("ours", "continuous", "nearest-neighbour")
+_ABLATIONS = ("ours", "no-entropy", "no-subsampling")
+_ALL = ("ours", "continuous", "nearest-neighbour", "no-entropy", "no-subsampling")
+
+# Tasks of the paper's main text, and the nine further ones of its appendix.
+_CREATE = ("create-push", "create-obstacle", "create-seesaw")
+_FURTHER_CREATE = (
+    "create-navigate",
+    "create-belt",
+    "create-buckets",
+    "create-cannon",
+    "create-collide",
+    "create-moving",
+    "create-ladder",
+    "create-basket",
+    "create-funnel",
+)
+
+
+@dataclass(frozen=True)
+class PaperFigure:
+    """A figure of the paper.
+
+    Attributes:
+      kind: bars, curves, finetune, representations, study or films.
+      title: what it shows.
+      cells: its settings, by task. Of a picture of representations, only these count.
+      budget: suffix of the preset of its runs.
+      study: name of the task's study that it shows.
+      note: below the table of its bars.
+    """
+
+    kind: str
+    title: str
+    cells: Mapping[str, tuple[Cell, ...]]
+    budget: str = ""
+    study: str = ""
+    note: str = ""
+
+
+def _cells(methods: Sequence[str], representation: str, *more: str) -> tuple[Cell, ...]:
+    """Methods on one representation, then ours on further ones."""
+    extra = tuple(Cell("ours", name) for name in more)
+    return (*(Cell(method, representation) for method in methods), *extra)
+
+
+def _each(tasks: Sequence[str], cells: tuple[Cell, ...]) -> dict[str, tuple[Cell, ...]]:
+    return dict.fromkeys(tasks, cells)
+
+
+_OURS = Cell("ours", "hvae")
+_TUNED = _cells(("ours", "nearest-neighbour"), "hvae")
+# The encoder of the analysis has seen its whole universe (spec method 10).
+_ANALYSED = _each(_CREATE, (Cell("ours", "hvae-oracle", variant="-analysis"),))
+
+FIGURES: dict[str, PaperFigure] = {
+    "4": PaperFigure(
+        "bars",
+        "baselines",
+        {
+            "grid_world": _cells(_BASELINES, "hvae", "vae"),
+            "recommender": _cells(_BASELINES, "product"),
+            **_each(_CREATE, _cells(_BASELINES, "hvae", "vae")),
+        },
+    ),
+    "5": PaperFigure(
+        "representations",
+        "held-out tools",
+        _each((*_CREATE, *_FURTHER_CREATE), _cells((), "", "hvae", "vae")),
+    ),
+    "6": PaperFigure(
+        "bars",
+        "ablations",
+        {
+            "grid_world": _cells(_ABLATIONS, "hvae"),
+            "recommender": _cells(_ABLATIONS, "product"),
+            **_each(_CREATE, _cells(_ABLATIONS, "hvae")),
+        },
+    ),
+    "7a": PaperFigure(
+        "bars",
+        "tools of unseen classes",
+        _each(_CREATE, (Cell("ours", "hvae", split="full"),)),
+        note="The paper's numbers are those of its last runs. Older runs in its release reached "
+        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`; "
+        "experiments spec 5), so that the target is uncertain.",
+    ),
+    "7b": PaperFigure(
+        "bars",
+        "alternate representations",
+        {
+            "grid_world": _cells(("ours",), "hvae", "hvae-onehot", "gt12", "hvae-oracle"),
+            **_each(_CREATE, _cells(("ours",), "hvae", "hvae-video", "gt32", "hvae-oracle")),
+        },
+    ),
+    "8": PaperFigure("films", "zero-shot episodes", _each((*_CREATE, *_FURTHER_CREATE), (_OURS,))),
+    "9a": PaperFigure("study", "angle to training tools", _ANALYSED, study="angle"),
+    "9b": PaperFigure("study", "distance to training tools", _ANALYSED, study="embedding"),
+    "9c": PaperFigure("study", "share of unseen tools", _ANALYSED, study="mix"),
+    "10": PaperFigure("finetune", "training on new actions", {"create-push": _TUNED}),
+    "14": PaperFigure(
+        "representations",
+        "held-out actions",
+        {"grid_world": _cells((), "", "hvae", "vae", "hvae-onehot", "gt12")},
+    ),
+    "15": PaperFigure(
+        "representations",
+        "held-out tools",
+        _each(
+            (*_CREATE, *_FURTHER_CREATE),
+            (*_cells((), "", "hvae", "vae", "hvae-video"), Cell("ours", "hvae", split="full")),
+        ),
+    ),
+    "18": PaperFigure("bars", "further tasks", _each(_FURTHER_CREATE, _cells(_ALL, "hvae", "vae"))),
+    "19": PaperFigure(
+        "finetune",
+        "training on new actions",
+        {
+            "grid_world": _TUNED,
+            "recommender": _cells(("ours", "nearest-neighbour"), "product"),
+            **_each(_CREATE[1:], _TUNED),
+        },
+    ),
+    "20": PaperFigure(
+        "bars",
+        "no reward for subgoals",
+        _each(_CREATE, (_OURS, Cell("ours", "hvae", variant="-no-subgoals"))),
+        note="Ours is paid for the goal only (spec create 6.6); the release does not record which "
+        "rewards the paper's runs lacked.",
+    ),
+    "21": PaperFigure(
+        "bars",
+        "position conditioned on the tool",
+        _each(_CREATE, (_OURS, Cell("ours", "hvae", conditions_position=True))),
+    ),
+    "22": PaperFigure(
+        "bars",
+        "fully observable",
+        {"recommender": _cells(_ALL, "product-mu")},
+        budget="-mu",
+    ),
+    "24": PaperFigure(
+        "curves",
+        "learning curves",
+        {
+            "grid_world": _cells(_ALL, "hvae", "vae"),
+            "recommender": _cells(_ALL, "product"),
+            **_each(_CREATE, _cells(_ALL, "hvae", "vae")),
+        },
+    ),
+}
+_SAME = {"10": "19", "19": "10"}  # The same curves: figure 10 has those of CREATE Push.
+
+
+def number_of(number: str, task: str) -> str:
+    """The figure that is meant: of two with the same content, the one that shows the task.
+
+    Raises:
+      UsageError: there is none, or it does not show the task.
+    """
+    if number not in FIGURES:
+        raise flag.UsageError(f"No figure {number!r}; choose of {', '.join(FIGURES)}.")
+    wanted = [number, *([_SAME[number]] if number in _SAME else [])]
+    for candidate in wanted:
+        if task in FIGURES[candidate].cells:
+            return candidate
+    shown = ", ".join(task for candidate in wanted for task in FIGURES[candidate].cells)
+    raise flag.UsageError(f"Figure {number} does not show {task}; it shows {shown}.")

@@ -1,0 +1,248 @@
+"""The commands that make what is missing, each in a process of its own, and how long they take.
+
+A domain inside jit is trained by `sweep`, all seeds in one program; one on the host by `train`, run
+by run.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import shlex
+import signal
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from experiments._artifacts import TABLE_FILE, parse_representation
+from experiments._flags import UsageError
+from experiments._methods import file_name
+from experiments._plots import amount
+from experiments._production import Cell, Source
+from jaxnew.task import StageTwoBudget
+
+
+@dataclass(frozen=True)
+class Job:
+    """A command that makes something that is missing.
+
+    Attributes:
+      title: what it makes.
+      command: `python -m experiments.NAME` without its beginning.
+      cost: how long it takes.
+      seconds: the same as a number; None if nobody measured it.
+    """
+
+    title: str
+    command: tuple[str, ...]
+    cost: str
+    seconds: float | None
+
+    def run(self) -> None:
+        """Runs the command in a process of its own, and lets it save and end on a signal.
+
+        Raises:
+          UsageError: the command failed, or was stopped.
+        """
+        print(f"{self.title} ({self.cost}): {self.text}", flush=True)
+        process = subprocess.Popen([sys.executable, "-m", *self._module, *self.command[1:]])
+        received: list[int] = []
+
+        def stop(number: int, frame: Any) -> None:
+            received.append(number)
+            if number == signal.SIGTERM:  # Ctrl-C reaches the process by itself.
+                process.terminate()
+
+        previous = {which: signal.signal(which, stop) for which in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            status = process.wait()
+        finally:
+            for which, handler in previous.items():
+                signal.signal(which, handler)
+        if received:
+            raise UsageError("Stopped; call the same command again to go on.")
+        if status:
+            raise UsageError(f"The command ended with status {status}: {self.text}")
+
+    @property
+    def _module(self) -> tuple[str, ...]:
+        return (f"experiments.{self.command[0]}",)
+
+    @property
+    def text(self) -> str:
+        """The whole command, for a shell."""
+        return shlex.join(["python", "-m", *self._module, *self.command[1:]])
+
+
+def embed_job(source: Source, representation: str) -> Job | None:
+    """What makes a representation; None if there is nothing to make."""
+    domain = source.domain
+    is_learned = representation.startswith(("hvae", "vae"))
+    if not is_learned or representation in source.given:
+        return None
+    if (source.embed_folder(representation) / TABLE_FILE).exists():
+        return None
+    budget = domain.stage_one(parse_representation(domain, representation).play, source.stage_one)
+    command = (
+        "embed",
+        # By the name of its actions, so that tasks which share them have one command.
+        f"--task={domain.task.actions_name or domain.task.reference}",
+        f"--split={domain.split_name}",
+        f"--representation={representation}",
+        f"--budget={source.stage_one}",
+        f"--runs={source.folder}",
+    )
+    return Job(f"Representation {representation}", command, budget.cost, None)
+
+
+def training_jobs(source: Source, cell: Cell, seeds: Sequence[int]) -> list[Job]:
+    """What trains a cell with some seeds: one program, or a run each on the host."""
+    if source.domain.task.host is not None:
+        return [train_job(source, cell, seed) for seed in seeds]
+    return [sweep_job(source, cell, seeds)] if seeds else []
+
+
+def train_job(source: Source, cell: Cell, seed: int, folder: Path | None = None) -> Job:
+    """What trains one run, and goes on with it where it was stopped.
+
+    Args:
+      source: of the cell.
+      folder: of the run; default: one that names all that the cell fixes.
+    """
+    budget = source.budget_of(cell.method)
+    if folder is None:
+        words = [file_name(cell.method), cell.representation]
+        words += ["conditioned"] if cell.conditions_position else []
+        words += [source.domain.split_name, source.budget, str(budget.num_updates), str(seed)]
+        folder = source.domain.folder(source.folder) / "-".join(words)
+    command = (
+        "train",
+        *_settings(source, cell),
+        f"--seed={seed}",
+        f"--workdir={folder}",
+        *([f"--workers={source.workers}"] if source.workers else []),
+        *_assignments(source, cell, budget),
+    )
+    steps = budget.num_updates * budget.ppo.steps_per_update
+    seconds = training_seconds(source, cell.method, steps, 1)
+    cost = duration(seconds)
+    if seconds is None:
+        cost += f"; a whole run of budget {source.budget} takes {budget.cost}"
+    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds)
+
+
+def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
+    """Flags of `train` and `sweep` that say what is trained."""
+    return (
+        f"--task={source.domain.task.reference}",
+        f"--split={source.domain.split_name}",
+        f"--method={cell.method}",
+        f"--representation={source.representation_flag(cell.representation)}",
+        f"--representation_budget={source.stage_one}",
+        f"--budget={source.budget}",
+        f"--runs={source.folder}",
+    )
+
+
+def _assignments(source: Source, cell: Cell, budget: StageTwoBudget) -> tuple[str, ...]:
+    conditioned = ["conditions_position=true"] if cell.conditions_position else []
+    listed = [*source.assignments, *conditioned, f"num_updates={budget.num_updates}"]
+    return tuple(f"--set={assignment}" for assignment in listed)
+
+
+def sweep_job(
+    source: Source,
+    cell: Cell,
+    seeds: Sequence[int],
+    folder: Path | None = None,
+    vary: Sequence[str] = (),
+) -> Job:
+    """What trains a cell with some seeds in one program.
+
+    Args:
+      source: of the cell.
+      folder: of the sweep; default: one that names all that the cell fixes.
+      vary: values of `--vary`, each `FIELD=VALUE,VALUE...`.
+    """
+    domain = source.domain
+    budget = source.budget_of(cell.method)
+    listed = ",".join(map(str, seeds))
+    name = (
+        f"sweep-{file_name(cell.method)}-{cell.representation}-{source.budget}-{budget.num_updates}"
+    )
+    folder = folder or domain.folder(source.folder) / f"{name}-{listed.replace(',', '-')}"
+    command = (
+        "sweep",
+        *_settings(source, cell),
+        f"--seeds={listed}",
+        f"--workdir={folder}",
+        *(f"--vary={values}" for values in vary),
+        *_assignments(source, cell, budget),
+    )
+    steps = budget.num_updates * budget.ppo.steps_per_update
+    num_runs = len(seeds) * math.prod(values.count(",") + 1 for values in vary)
+    seconds = training_seconds(source, cell.method, steps * num_runs, num_runs)
+    title = f"{cell.label}, {num_runs} runs of {amount(steps)} in one program"
+    return Job(title, command, duration(seconds), seconds)
+
+
+def training_seconds(source: Source, method: str, steps: float, num_runs: int) -> float | None:
+    """How long `steps` of training take, in all of `num_runs` runs of a sweep.
+
+    A single run on the host is foretold as on one core; its workers make it faster on several.
+    """
+    measured = source.domain.task.measured
+    if measured is None:
+        return None
+    rate = measured.training.get(method, measured.training["ours"])
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
+    devices = max(n for n in range(1, cores + 1) if num_runs % n == 0)
+    return steps / (rate * devices)
+
+
+def evaluation_seconds(source: Source, num_episodes: float) -> float | None:
+    """How long so many episodes take."""
+    measured = source.domain.task.measured
+    return None if measured is None else num_episodes / measured.evaluation
+
+
+def duration(seconds: float | None) -> str:
+    """Seconds for reading."""
+    if seconds is None:
+        return "nobody measured how long it takes"
+    if seconds < 90:
+        return f"about {max(1, round(seconds))} s"
+    if seconds < 5400:
+        return f"about {round(seconds / 60)} minutes"
+    return f"about {seconds / 3600:.1f} hours"
+
+
+def announce(
+    jobs: Sequence[Job], episodes: int, evaluation: float | None, tuned: Sequence[float | None] = ()
+) -> None:
+    """Says what will be made and how long it takes.
+
+    Args:
+      episodes: of evaluations, and `evaluation`: their seconds.
+      tuned: seconds of each fine-tuning.
+    """
+    if not jobs and not episodes and not tuned:
+        print("All runs and evaluations are there.")
+        return
+    print("Missing:")
+    for job in jobs:
+        print(f"  {job.title}: {job.cost}\n    {job.text}")
+    if episodes:
+        print(f"  {episodes:,} episodes of evaluation: {duration(evaluation)}")
+    for seconds in tuned:
+        cost = duration(seconds) if seconds is None else f"up to {duration(seconds)}"
+        print(f"  fine-tuning and its zero-shot lines, where not there: {cost}")
+    numbers = [job.seconds for job in jobs] + ([evaluation] if episodes else []) + list(tuned)
+    known = [seconds for seconds in numbers if seconds is not None]
+    lacking = len(numbers) - len(known)
+    total = f"In all {duration(sum(known))}" if known else "Nobody measured how long it takes"
+    total += f", and {lacking} unmeasured" if known and lacking else ""
+    print(f"  {total}. It can be stopped, and called again to go on.")
