@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import chex
 import flax.struct
 import jax
 import jax.numpy as jnp
@@ -88,11 +89,19 @@ def render_gray(
     positions: jax.Array,
     quaternions: jax.Array,
     camera: Camera,
-    has_shadows: bool = False,
+    *,
+    has_shadows: bool = True,
 ) -> jax.Array:
     """The observation of the task: shapes on their table (spec 6).
 
-    Args: as for `render_rgb`.
+    The original casts shadows. Without them a picture costs a third and means rise by about 2 %.
+
+    Args:
+      shape_ids: int32[N], see `render_rgb`.
+      positions: f32[N, 3] m.
+      quaternions: f32[N, 4].
+      camera: usually `task_camera`.
+      has_shadows: whether the two spots cast shadows.
 
     Returns:
       uint8[84, 84] 0.299 R + 0.587 G + 0.114 B of the 8-bit picture, rounded.
@@ -111,13 +120,13 @@ def render_rgb(
     camera: Camera,
     *,
     has_table: bool,
-    has_shadows: bool = False,
+    has_shadows: bool,
 ) -> jax.Array:
     """A picture of shapes before a black background. Pure; all arrays may be traced and vmapped.
 
     Args:
       shape_ids: int32[N] ids in 0..809; an id below 0 is not drawn.
-      positions: f32[N, 3] origins of the shapes, m.
+      positions: f32[N, 3] origins of the shapes, m; a shape at one that is not finite is not drawn.
       quaternions: f32[N, 4] (w, x, y, z) rotations of the shapes, the yaw of their ids included
         (`ShapeLibrary.quaternion` for a shape as it is dropped); unit length.
       camera: where from.
@@ -129,6 +138,9 @@ def render_rgb(
     """
     library = shape_library()
     ids = jnp.asarray(shape_ids, jnp.int32)
+    chex.assert_rank(ids, 1)
+    chex.assert_shape(positions, (len(ids), 3))
+    chex.assert_shape(quaternions, (len(ids), 4))
     bodies = Bodies(
         label=jnp.asarray(library.class_labels)[ids],
         s=jnp.where(ids < 0, 0.0, jnp.asarray(library.s, jnp.float32)[ids]),

@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from envs_mjx.shape_stacking import shape_library, shape_universe
 from envs_mjx.shape_stacking.shapes import shape_name
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
+from tests.envs_mjx.mujoco_pictures import faces, pieces, text
 from tests.envs_mjx.shape_solids import SOLIDS
 
 mujoco = pytest.importorskip("mujoco")
@@ -120,10 +118,10 @@ def test_geometry_of_the_spec_scales_with_s(name: str) -> None:
 @pytest.mark.oracle
 @pytest.mark.parametrize("name", CLASS_NAMES)
 def test_moments_equal_sums_over_random_points(name: str) -> None:
-    half, is_inside = SOLIDS[name]
+    half, outside = SOLIDS[name]
     points = np.random.default_rng(0).uniform(-1, 1, (400_000, 3)) * half
     cell = np.prod(half) * 8 / len(points)
-    points = points[is_inside(*points.T)]
+    points = points[outside(*points.T) <= 0]
     library, i = shape_library(), ids_of(name)[-1]
     s = library.s[i]
     # A fraction q of n points lies inside: a deviation of sqrt((1 - q) / (q n)) < 0.3 %, q > 0.2.
@@ -136,57 +134,16 @@ def test_moments_equal_sums_over_random_points(name: str) -> None:
     np.testing.assert_allclose(inertia, expected, atol=0.02 * expected.max())
 
 
-def hull_geoms(name: str) -> list[np.ndarray]:
-    """Corners of convex pieces that make up a class at s = 1, round sides in many chords."""
-    turn = np.linspace(0, 2 * PI, 96, endpoint=False)
-    half_turn = np.linspace(0, PI, 97)
-    ends = np.array([-1.0, 1.0])
-    if name == "cone":
-        base = np.stack([np.cos(turn), np.sin(turn), -np.ones(96)], -1)
-        return [np.vstack([base, [0, 0, 1]])]
-    if name == "dome":
-        return [np.array([(np.cos(a), y, np.sin(a) - 0.5) for a in half_turn for y in ends])]
-    if name == "triangle":
-        return [np.array([(x, y, z) for x, z in [(-1, -1), (1, -1), (-1, 1)] for y in ends])]
-    if name == "tall_triangle":
-        return [np.array([(x, y, z) for x, z in [(-1, -2), (1, -2), (-1, 2)] for y in ends])]
-    if name == "tetrahedron":
-        return [np.array([(-1, -1, -1), (1, -1, -1), (1, 1, -1), (-1, 1, -1), (0, 0, 1.0)])]
-    assert name == "arch"
-    arc = [(1.25 * np.cos(a), 1.25 * np.sin(a) - 1) for a in half_turn]
-    outline = [(2.0, -1.0), *arc, (-2.0, -1.0)]
-    pieces = [
-        (outline[0], (1.25, -1.0)),
-        *itertools.pairwise(arc),
-        (arc[-1], outline[-1]),
-    ]
-    return [
-        np.array([(x, y, z) for p in piece for z in (p[1], 1) for x in p[:1] for y in ends])
-        for piece in pieces
-    ]
-
-
-def compile_body(pieces: list[np.ndarray], quaternion: np.ndarray) -> mujoco.MjModel:
+def compile_body(parts: list[np.ndarray], quaternion: np.ndarray) -> mujoco.MjModel:
     meshes, geoms = "", ""
-    for k, points in enumerate(pieces):
-        vertices = " ".join(map(str, points.ravel()))
-        meshes += f"<mesh name='m{k}' inertia='exact' vertex='{vertices}' face='{faces(points)}'/>"
+    for k, points in enumerate(parts):
+        meshes += f"<mesh name='m{k}' inertia='exact' vertex='{text(points)}' "
+        meshes += f"face='{text(faces(points))}'/>"
         geoms += f"<geom type='mesh' mesh='m{k}'/>"
-    rotation = " ".join(map(str, quaternion))
     return mujoco.MjModel.from_xml_string(
         f"<mujoco><asset>{meshes}</asset><worldbody>"
-        f"<body quat='{rotation}'><freejoint/>{geoms}</body></worldbody></mujoco>"
+        f"<body quat='{text(quaternion)}'><freejoint/>{geoms}</body></worldbody></mujoco>"
     )
-
-
-def faces(points: np.ndarray) -> str:
-    hull = ConvexHull(points)
-    outward = []
-    for corners, plane in zip(hull.simplices, hull.equations, strict=True):
-        a, b, c = points[corners]
-        is_outward = np.cross(b - a, c - a) @ plane[:3] > 0
-        outward += list(corners if is_outward else corners[::-1])
-    return " ".join(map(str, outward))
 
 
 @pytest.mark.oracle
@@ -205,9 +162,7 @@ def faces(points: np.ndarray) -> str:
 )
 def test_mujoco_compiles_the_same_mass_and_inertia(name: str, tolerance: float) -> None:
     library, i = shape_library(), ids_of(name)[-1]
-    model = compile_body(
-        [library.s[i] * piece for piece in hull_geoms(name)], library.quaternion[i]
-    )
+    model = compile_body([library.s[i] * piece for piece in pieces(name)], library.quaternion[i])
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
     assert model.body_mass[1] == pytest.approx(library.mass[i], rel=tolerance)
