@@ -61,9 +61,9 @@ def task_camera(position_dim: int = 1) -> Camera:
     """
     if position_dim not in (0, 1, 2):
         raise ValueError(f"position_dim={position_dim} is not a variant; it is 0, 1 or 2.")
-    height, turn = ((0.0, 7.0, 2.0), -1.57) if position_dim < 2 else ((0.0, 4.0, 5.0), -0.8)
+    position, turn = ((0.0, 7.0, 2.0), -1.57) if position_dim < 2 else ((0.0, 4.0, 5.0), -0.8)
     return Camera(
-        position=jnp.array(height),
+        position=jnp.array(position),
         right=jnp.array((1.0, 0.0, 0.0)),
         down=jnp.array((0.0, math.cos(turn), math.sin(turn))),
         forward=jnp.array((0.0, math.sin(turn), -math.cos(turn))),
@@ -125,7 +125,7 @@ def render_rgb(
     """A picture of shapes before a black background. Pure; all arrays may be traced and vmapped.
 
     Args:
-      shape_ids: int32[N] ids in 0..809; an id below 0 is not drawn.
+      shape_ids: int32[N] ids in 0..809; an id below 0 is not drawn, one above 809 is drawn as 809.
       positions: f32[N, 3] origins of the shapes, m; a shape at one that is not finite is not drawn.
       quaternions: f32[N, 4] (w, x, y, z) rotations of the shapes, the yaw of their ids included
         (`ShapeLibrary.quaternion` for a shape as it is dropped); unit length.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import mujoco
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
@@ -11,8 +12,6 @@ from envs_mjx.shape_stacking.shapes import shape_name
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 from tests.envs_mjx.mujoco_pictures import faces, pieces, text
 from tests.envs_mjx.shape_solids import SOLIDS
-
-mujoco = pytest.importorskip("mujoco")
 
 pytestmark = pytest.mark.golden
 
