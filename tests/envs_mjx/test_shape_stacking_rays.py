@@ -128,6 +128,36 @@ def test_rays_along_the_axes_of_solids(name: str) -> None:
     np.testing.assert_allclose(found, S * expected, atol=2e-5)
 
 
+def test_rays_along_the_side_of_a_cone() -> None:
+    """Exactly as steep as the cone's side: one of the two crossings is at infinity."""
+    turns = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    rays = [
+        (sign * np.array([np.cos(a), np.sin(a), -2.0]) / np.sqrt(5), b)
+        for a in turns
+        for sign in (-1, 1)
+        for b in ((0.1, 0.2, -0.6), (-0.3, 0.1, 0.0), (0.9, 0.9, 0.5))
+    ]
+    directions = np.array([direction for direction, _ in rays])
+    origins = np.array([through for _, through in rays]) - 5 * directions
+    expected, _, _ = search("cone", origins, directions)
+    body = body_of("cone", Rotation.identity())
+    found, _ = jax.jit(enter)(body, components(POSITION + S * origins), components(directions))
+    assert 0.5 < np.isfinite(expected).mean() < 1.0
+    np.testing.assert_allclose(found, S * expected, atol=2e-5)
+
+
+def test_no_nan_is_made_where_a_ray_touches_a_sphere() -> None:
+    """Both crossings and their product are zero there; outside of jit every step is checked."""
+    sphere = Bodies(
+        jnp.int32(CLASS_NAMES.index("sphere")), jnp.float32(1), jnp.zeros(3), jnp.eye(3)
+    )
+    with jax.debug_nans(True):
+        distance, _ = enter(
+            sphere, components(np.array([[-5.0, 0, 1]])), components(np.array([[1.0, 0, 0]]))
+        )
+    assert distance.tolist() == [np.inf]
+
+
 def test_rays_from_far_away_still_meet_small_shapes() -> None:
     """The camera is 7 m away and a shape may be 0.08 m small: 90 units of s."""
     grid = np.linspace(-1.2, 1.2, 41)
@@ -158,7 +188,8 @@ def test_rays_do_not_look_back_nor_from_inside() -> None:
 def test_nearest_body_wins_in_any_order() -> None:
     near, far = body_of("sphere"), body_of("cube")
     far = far.replace(position=far.position + jnp.array([0.0, 2.0, 0.0]))
-    absent = near.replace(s=jnp.float32(0), position=near.position - 1.0)
+    # At any size it would be met first.
+    absent = near.replace(s=jnp.float32(0), position=near.position - jnp.array([0.0, 0.5, 0.0]))
     start = components(np.array([POSITION - [0, 3, 0]] * 2))
     along = components(np.array([[0.0, 1, 0], [0, -1, 0]]))
     for order in ([near, far, absent], [absent, far, near]):
