@@ -109,7 +109,8 @@ def render_gray(
     picture = render_rgb(
         shape_ids, positions, quaternions, camera, has_table=True, has_shadows=has_shadows
     )
-    gray = (picture.astype(jnp.float32) * jnp.array(_GRAY)).sum(-1)
+    red, green, blue = jnp.moveaxis(picture.astype(jnp.float32), -1, 0)
+    gray = _GRAY[0] * red + _GRAY[1] * green + _GRAY[2] * blue
     return jnp.round(gray).astype(jnp.uint8)
 
 

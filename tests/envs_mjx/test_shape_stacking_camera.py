@@ -184,23 +184,24 @@ def test_orbit_is_not_mirrored() -> None:
     assert np.linalg.det(axes) == pytest.approx(1, abs=1e-6)
 
 
-def test_light_of_one_point() -> None:
-    """Spec 6.2 by hand, for the front of cube 690 at the origin, seen from +y."""
-    picture = np.asarray(around(690)[1]) / 255
+def test_light_by_hand() -> None:
+    """Spec 6.2 for a row of pixels on the front of cube 690 at the origin, seen from +y."""
+    picture = np.asarray(around(690)[1])
     s, color = LIBRARY.s[690], LIBRARY.color[690]
-    ray = np.array([0.5, -0.5]) / 101.4  # Column 42 and row 41, right and up of the middle.
     position = np.array([0, 2, 1.0])
     forward = -position / np.linalg.norm(position)
-    up = np.cross([-1, 0, 0], forward)
-    direction = forward + ray[0] * np.array([-1, 0, 0]) - ray[1] * up
-    point = position + (s - 2) / direction[1] * direction
-    light = 0.25 + 0.1 + 0.4 * -forward[1]
-    for z in (4, 1):
-        towards = np.array([0, 4, z]) - point
-        towards /= np.linalg.norm(towards)
-        light += 1.5 * towards[1] * towards[1] ** 10 * (towards[1] > np.cos(np.pi / 4))
-    expected = np.clip(color * light, 0, 1)
-    np.testing.assert_allclose(picture[41, 42], expected, atol=0.5 / 255 + 1e-4)
+    right, down = np.array([-1.0, 0, 0]), np.cross(forward, [-1.0, 0, 0])
+    for column in range(33, 51):
+        direction = forward + (column - 41.5) / 101.4 * right - 0.5 / 101.4 * down
+        point = position + (s - 2) / direction[1] * direction
+        light = 0.25 + 0.1 + 0.4 * -forward[1]
+        for z in (4, 1):
+            towards = np.array([0, 4, z]) - point
+            towards /= np.linalg.norm(towards)
+            light += 1.5 * towards[1] * towards[1] ** 10 * (towards[1] > np.cos(np.pi / 4))
+        expected = np.clip(color * light, 0, 1)
+        # Rounded to 8 bits; 101.4 is given to four digits.
+        np.testing.assert_allclose(picture[41, column], 255 * expected, atol=0.51)
 
 
 def test_gray_is_the_weighted_sum_of_the_8_bit_picture() -> None:
@@ -222,9 +223,11 @@ def test_table_is_a_lit_rectangle() -> None:
     assert extent(picture.any(-1))[0] == np.ceil(row)
     assert (picture[..., 0] == picture[..., 1]).all()
     assert not rgb(*nothing, task_camera(2), has_table=False, has_shadows=False).any()
-    # From below nothing hides the shapes.
-    below = Camera(*(jnp.array(v) for v in ((0, 0, -3.0), (1.0, 0, 0), (0, 1.0, 0), (0, 0, 1.0))))
-    assert not rgb(*nothing, below, has_table=True, has_shadows=False).any()
+    # Away from it, and from below, where nothing hides the shapes.
+    for height, way in ((1.0, 1.0), (-3.0, -1.0), (-3.0, 1.0)):
+        axes = ((0.0, 0.0, height), (1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, way))
+        camera = Camera(*(jnp.array(axis) for axis in axes))
+        assert not rgb(*nothing, camera, has_table=True, has_shadows=False).any()
 
 
 def test_nearer_shapes_hide_farther_ones_in_any_order() -> None:
