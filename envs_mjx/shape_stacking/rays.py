@@ -103,7 +103,7 @@ def nearest(bodies: Bodies, origins: Vector, directions: Vector, distance: jax.A
 
     Args:
       bodies: N bodies; the results number them 0..N-1.
-      origins: f32[] or f32[P] each, m; not inside a body.
+      origins: f32[] or f32[P] each, m; not inside a body, but maybe in an arch's opening.
       directions: f32[P] each, unit vectors.
       distance: f32[P] to whatever else the rays meet, m.
     """
@@ -198,7 +198,9 @@ def _enter_solid(label: jax.Array, start: Vector, along: Vector) -> tuple[jax.Ar
     first, last = jnp.maximum(first, round_first), jnp.minimum(last, round_last)
 
     open_first, open_last = _cross_quadric(jnp.asarray(table.openings)[label], start, along)
-    is_through = (open_first < first) & (first < open_last)
+    # Also for rays that start in the opening, as shadows of an arch on itself do.
+    begin = jnp.maximum(first, 0.0)
+    is_through = (open_first < begin) & (begin < open_last)
     surface = jnp.where(is_through, _OPENING, surface)
     first = jnp.where(is_through, open_last, first)
 

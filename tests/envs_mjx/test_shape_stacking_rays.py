@@ -185,6 +185,18 @@ def test_rays_do_not_look_back_nor_from_inside() -> None:
     np.testing.assert_allclose(distance, [2 * S, np.inf, np.inf], rtol=1e-5)
 
 
+def test_rays_from_within_the_opening_of_an_arch() -> None:
+    """From the middle of its base: up and sideways to the vault, along the opening out of it."""
+    body = body_of("arch", Rotation.identity())
+    ways = np.array([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 1, 0], [0, 0, -1]])
+    start = components(np.tile(POSITION + S * np.array([0, 0, -0.999]), (5, 1)))
+    distance, _ = jax.jit(enter)(body, start, components(ways))
+    vault = [1.249, 1.25 - 0.0008, 1.25 - 0.0008]
+    np.testing.assert_allclose(
+        distance, [*(S * value for value in vault), np.inf, np.inf], rtol=1e-5
+    )
+
+
 def test_nearest_body_wins_in_any_order() -> None:
     near, far = body_of("sphere"), body_of("cube")
     far = far.replace(position=far.position + jnp.array([0.0, 2.0, 0.0]))
