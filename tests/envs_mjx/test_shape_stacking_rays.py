@@ -186,15 +186,17 @@ def test_rays_do_not_look_back_nor_from_inside() -> None:
 
 
 def test_rays_from_within_the_opening_of_an_arch() -> None:
-    """From the middle of its base: up and sideways to the vault, along the opening out of it."""
+    """To the vault above, from one side of the vault to the other, and out along the opening."""
     body = body_of("arch", Rotation.identity())
-    ways = np.array([[0.0, 0, 1], [0.6, 0, 0.8], [-0.6, 0, 0.8], [0, 1, 0], [0, 0, -1]])
-    start = components(np.tile(POSITION + S * np.array([0, 0, -0.999]), (5, 1)))
-    distance, _ = jax.jit(enter)(body, start, components(ways))
-    vault = [1.249, 1.25 - 0.0008, 1.25 - 0.0008]
-    np.testing.assert_allclose(
-        distance, [*(S * value for value in vault), np.inf, np.inf], rtol=1e-5
-    )
+    half_width = np.sqrt(1.25**2 - 0.5**2)  # Half-way up to the middle of the box.
+    rays = {
+        ((0, 0, -0.999), (0, 0, 1)): 1.249,
+        ((0.001 - half_width, 0, -0.5), (1, 0, 0)): 2 * half_width - 0.001,
+        ((0.001 - half_width, 0, -0.5), (0, 1, 0)): np.inf,
+    }
+    starts, ways = (np.array(part, float) for part in zip(*rays, strict=True))
+    distance, _ = jax.jit(enter)(body, components(POSITION + S * starts), components(ways))
+    np.testing.assert_allclose(distance, [S * value for value in rays.values()], rtol=1e-5)
 
 
 def test_nearest_body_wins_in_any_order() -> None:
