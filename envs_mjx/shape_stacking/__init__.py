@@ -1,0 +1,6 @@
+"""Shape Stacking: towers of shapes on a table (spec shape_stacking)."""
+
+from envs_mjx.shape_stacking.shapes import ShapeLibrary, shape_library, shape_universe
+from envs_mjx.shape_stacking.splits import published_split
+
+__all__ = ["ShapeLibrary", "published_split", "shape_library", "shape_universe"]
