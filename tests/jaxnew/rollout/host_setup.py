@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.environment import ActionSpec
+from jaxnew.metrics import TIME_PREFIX
 from jaxnew.policy import make_method
 from jaxnew.policy.method import MethodContext
 from jaxnew.rollout.device import RolloutConfig
@@ -69,14 +70,14 @@ def rollout_of(
 
 
 def play(rollout: HostRollout, num_rollouts: int = 2, name: str = "ours") -> Any:
-    """States between rollouts, batches and sums."""
+    """States between rollouts, batches and sums, without the seconds that they took."""
     states, batches, sums = [rollout.init(jax.random.key(1), POOL)], [], []
     for k in range(num_rollouts):
         key = jax.random.fold_in(jax.random.key(4), k)
         state, batch, total = rollout.collect(key, states[-1], params_of(name), TABLE, POOL)
         states.append(state)
         batches.append(batch)
-        sums.append(total)
+        sums.append({k: v for k, v in total.items() if not k.startswith(TIME_PREFIX)})
     return states, batches, sums
 
 
