@@ -24,6 +24,7 @@ SUBJECTS = (
     "pool",
     "create",
     "host_training",
+    "stacking",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
