@@ -26,8 +26,6 @@ from experiments import _flags as flag
 from experiments import _stacking as stacking
 from experiments._stacking import SETTLE_ONLY, Drop
 
-EPISODES = flags.DEFINE_integer("episodes", 60, "Episodes of each anchor.", lower_bound=2)
-
 SET_SIZE = 20
 FLAT_TOPPED = (
     "horizontal_rectangle",
@@ -184,9 +182,12 @@ def main() -> None:
     print(f"\nMuJoCo's C engine {version}. Values beyond the tolerance are bold.\n")
     print("## Figures of the spec (m)\n")
     print(figures_table(engines))
-    print(f"\n## Policies without training, {EPISODES.value} episodes, mean +- standard error\n")
-    print(anchors_table(engines, EPISODES.value, flag.SEED.value))
+    episodes = flags.FLAGS.episodes
+    print(f"\n## Policies without training, {episodes} episodes, mean +- standard error\n")
+    print(anchors_table(engines, episodes, flag.SEED.value))
 
 
 if __name__ == "__main__":
+    # Not at import: other commands have a flag of this name.
+    flags.DEFINE_integer("episodes", 60, "Episodes of each anchor.", lower_bound=2)
     flag.run_command(main)

@@ -161,18 +161,23 @@ def test_on_the_host_every_seed_is_a_command(capsys: pytest.CaptureFixture[str])
     )
     assert first.command != second.command
     assert first.title == "ours, hvae, conditioned position, seed 1, 1 M steps"
-    assert first.cost.endswith("a whole run of budget smoke takes seconds")
+    rate = source.domain.task.measured.training["ours"]
+    assert first.seconds == pytest.approx(20834 * 48 / rate)
+    assert first.cost == "about 35 minutes"
     assert training_jobs(source, OURS, []) == []
     (job,) = training_jobs(source.of(NO_SUBGOALS), NO_SUBGOALS, [1])
     assert "--task=create-push-no-subgoals" in job.command
     assert "--set=conditions_position=true" not in job.command
     (job,) = training_jobs(source.of(FULL), FULL, [1])
     assert "--split=full" in job.command
-    announce([first, second], 0, None)
+    unknown = replace(source.domain, task=replace(source.domain.task, measured=None))
+    jobs = training_jobs(replace(source, domain=unknown), CONDITIONED, [1, 2])
+    assert jobs[0].cost.endswith("a whole run of budget smoke takes seconds")
+    announce(jobs, 0, None)
     text = capsys.readouterr().out
     assert text.count("python -m experiments.train --task=create-push") == 2
     assert "Nobody measured how long it takes. It can be stopped" in text
-    announce([replace(first, seconds=60.0), second], 100, 60.0)
+    announce([replace(first, seconds=60.0), jobs[1]], 100, 60.0)
     assert "In all about 2 minutes, and 1 unmeasured." in capsys.readouterr().out
 
 
