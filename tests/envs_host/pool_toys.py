@@ -145,7 +145,7 @@ class Spy(Chaotic):
 
 
 def misbehave(fault: str) -> None:
-    print(f"about to {fault}")
+    sys.stdout.write(f"about to {fault}\n")  # In one piece: workers share the pipe. `print` is two.
     if fault == "raise":
         raise ZeroDivisionError("a fault in the physics")
     if fault == "exit":
