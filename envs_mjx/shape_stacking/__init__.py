@@ -1,6 +1,15 @@
 """Shape Stacking: towers of shapes on a table (spec shape_stacking)."""
 
+from envs_mjx.shape_stacking.environment import ShapeStacking, StackingParams, StackingState
 from envs_mjx.shape_stacking.shapes import ShapeLibrary, shape_library, shape_universe
 from envs_mjx.shape_stacking.splits import published_split
 
-__all__ = ["ShapeLibrary", "published_split", "shape_library", "shape_universe"]
+__all__ = [
+    "ShapeLibrary",
+    "ShapeStacking",
+    "StackingParams",
+    "StackingState",
+    "published_split",
+    "shape_library",
+    "shape_universe",
+]

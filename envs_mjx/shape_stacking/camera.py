@@ -84,7 +84,7 @@ def orbit_camera(azimuth: jax.Array, height: jax.Array, distance: float = 2.0) -
     return Camera(position=position, right=right, down=jnp.cross(forward, right), forward=forward)
 
 
-def render_gray(
+def render(
     shape_ids: jax.Array,
     positions: jax.Array,
     quaternions: jax.Array,

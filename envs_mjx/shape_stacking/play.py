@@ -51,10 +51,9 @@ def viewpoints(
 def record_block(
     seed: int, ids: np.ndarray, num_recordings: int, num_distinct_views: int = NUM_VIEWS
 ) -> np.ndarray:
-    """Pictures of shapes; see `jaxnew.observations.collect`.
+    """The viewpoints that shapes are recorded from; `draw_pictures` makes pictures of them.
 
-    A shape's origin is at (0, 0, 0), it has the yaw and the colour of its id, the background is
-    black. Nothing moves: the step that the original simulates before it looks is left out.
+    See `jaxnew.observations.collect`.
 
     Args:
       seed: of the viewpoints, which all shapes share.
@@ -63,7 +62,24 @@ def record_block(
       num_distinct_views: see `viewpoints`.
 
     Returns:
-      uint8[n, S, 84, 84, 3] RGB.
+      f32[n, S, 2] azimuth, rad, and height, m.
+    """
+    views = np.stack(viewpoints(seed, num_recordings, num_distinct_views), axis=-1)
+    return np.tile(views, (len(ids), 1, 1))
+
+
+def draw_pictures(ids: np.ndarray, views: np.ndarray) -> np.ndarray:
+    """Pictures of shapes.
+
+    A shape's origin is at (0, 0, 0), it has the yaw and the colour of its id, the background is
+    black. Nothing moves: the step that the original simulates before it looks is left out.
+
+    Args:
+      ids: int32[n] shapes.
+      views: f32[n, 2] azimuth, rad, and height, m, of each.
+
+    Returns:
+      uint8[n, 84, 84, 3] RGB.
 
     Raises:
       ValueError: an id is no shape.
@@ -72,26 +88,21 @@ def record_block(
     outside = ids[(ids < 0) | (ids >= NUM_SHAPES)]
     if outside.size:
         raise ValueError(f"Shape {outside[0]} does not exist; ids are 0..{NUM_SHAPES - 1}.")
-    azimuth, height = viewpoints(seed, num_recordings, num_distinct_views)
     views_at_once = _VIEWS_AT_ONCE.get(jax.default_backend(), _VIEWS_AT_ONCE_ELSEWHERE)
-    return np.asarray(_record(jnp.asarray(ids, jnp.int32), azimuth, height, views_at_once))
+    views = np.asarray(views, np.float32)
+    return np.asarray(_draw(jnp.asarray(ids, jnp.int32), jnp.asarray(views), views_at_once))
 
 
 @partial(jax.jit, static_argnames="views_at_once")
-def _record(ids: jax.Array, azimuth: jax.Array, height: jax.Array, views_at_once: int) -> jax.Array:
-    """uint8[n, S, 84, 84, 3], one shape after the other."""
-
-    def of_shape(shape_id: jax.Array) -> jax.Array:
-        look = partial(_picture, shape_id)
-        return jax.lax.map(look, (azimuth, height), batch_size=views_at_once)
-
-    return jax.lax.map(of_shape, ids)
+def _draw(ids: jax.Array, views: jax.Array, views_at_once: int) -> jax.Array:
+    """uint8[n, 84, 84, 3]"""
+    return jax.lax.map(lambda x: _picture(*x), (ids, views), batch_size=views_at_once)
 
 
-def _picture(shape_id: jax.Array, view: tuple[jax.Array, jax.Array]) -> jax.Array:
-    """uint8[84, 84, 3]"""
+def _picture(shape_id: jax.Array, view: jax.Array) -> jax.Array:
+    """uint8[84, 84, 3] from view f32[2]."""
     quaternion = jnp.asarray(shape_library().quaternion, jnp.float32)[shape_id]
-    camera = orbit_camera(*view)
+    camera = orbit_camera(view[0], view[1])
     # A shape alone has nothing to cast shadows on, but for the sides of an arch's opening.
     return render_rgb(
         shape_id[None],

@@ -74,6 +74,13 @@ def transposed_convolution(x: jax.Array, kernel: jax.Array, padding: int) -> jax
       padding: 0 or more.
     """
     size = kernel.shape[0]
+    if size == 2:  # Patches touch and do not overlap: nothing is to be added.
+        batch, height, width, channels = x.shape
+        # One product: as an einsum into the final order, XLA takes a quarter longer on a CPU.
+        columns = jnp.moveaxis(kernel, 2, 0).reshape(channels, -1)
+        patches = (x.reshape(-1, channels) @ columns).reshape(batch, height, width, 2, 2, -1)
+        total = jnp.swapaxes(patches, 2, 3).reshape(batch, 2 * height, 2 * width, -1)
+        return _without_border(total, padding)
     products = jnp.einsum("bhwc,ijco->ijbhwo", x, kernel)
     total = None
     for i in range(size):
@@ -82,7 +89,12 @@ def transposed_convolution(x: jax.Array, kernel: jax.Array, padding: int) -> jax
             placed = jax.lax.pad(products[i, j], jnp.zeros((), x.dtype), spread)
             total = placed if total is None else total + placed
     assert total is not None
-    return total[:, padding : total.shape[1] - padding, padding : total.shape[2] - padding]
+    return _without_border(total, padding)
+
+
+def _without_border(images: jax.Array, border: int) -> jax.Array:
+    """Images [B, H, W, C] less `border` pixels on all sides."""
+    return images[:, border : images.shape[1] - border, border : images.shape[2] - border]
 
 
 class Convolution(nn.Module):

@@ -19,7 +19,7 @@ from envs_mjx.shape_stacking import shape_library
 from envs_mjx.shape_stacking.camera import (
     Camera,
     orbit_camera,
-    render_gray,
+    render,
     render_rgb,
     task_camera,
 )
@@ -32,7 +32,7 @@ NUM_BODIES = 12
 CYLINDER, S = 799, LIBRARY.s[799]
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
-gray = jax.jit(render_gray, static_argnames="has_shadows")
+gray = jax.jit(render, static_argnames="has_shadows")
 rgb = jax.jit(render_rgb, static_argnames=("has_table", "has_shadows"))
 
 
@@ -298,7 +298,7 @@ def test_vmap_and_jit_give_the_same_pictures() -> None:
     crowds = [crowd(seed, 0.6) for seed in range(3)]
     ids, positions, quaternions = (np.stack(part) for part in zip(*crowds, strict=True))
     camera = task_camera()
-    together = jax.jit(jax.vmap(lambda i, p, q: render_gray(i, p, q, camera)))(
+    together = jax.jit(jax.vmap(lambda i, p, q: render(i, p, q, camera)))(
         ids, positions, quaternions
     )
     assert together.shape == (3, 84, 84)
@@ -318,9 +318,9 @@ def test_camera_of_an_unknown_variant(position_dim: int) -> None:
 def test_shapes_of_the_arguments_are_checked() -> None:
     ids, positions, quaternions = crowd(0, 0.5)
     with pytest.raises(AssertionError, match="shape"):
-        render_gray(ids, positions[:5], quaternions, task_camera())
+        render(ids, positions[:5], quaternions, task_camera())
     with pytest.raises(AssertionError, match="shape"):
-        render_gray(ids, positions, quaternions[:, :3], task_camera())
+        render(ids, positions, quaternions[:, :3], task_camera())
 
 
 def mujoco_draws(scenes: list[dict[str, Any]], folder: Path) -> dict[str, np.ndarray]:

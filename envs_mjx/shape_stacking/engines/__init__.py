@@ -13,7 +13,9 @@ import numpy as np
 
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 
-__all__ = ["Engine", "Settled", "check_state"]
+__all__ = ["PHYSICS", "Engine", "Settled", "check_state", "make_engine"]
+
+PHYSICS = ("auto", "mujoco")
 
 
 class Settled(NamedTuple):
@@ -79,3 +81,19 @@ def check_state(
             f"shape_ids, qpos and qvel are {shape_ids.dtype}, {qpos.dtype}, {qvel.dtype}; "
             "give int32, float32 and float32."
         )
+
+
+def make_engine(physics: str = "auto") -> Engine:
+    """An engine by its name.
+
+    Args:
+      physics: `mujoco`: MuJoCo's C engine, on the host. `auto`: the same.
+
+    Raises:
+      ValueError: there is no such engine.
+    """
+    if physics not in PHYSICS:
+        raise ValueError(f"physics={physics!r} is unknown; choose one of {PHYSICS}.")
+    from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+
+    return MujocoC()

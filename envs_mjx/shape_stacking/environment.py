@@ -1,0 +1,246 @@
+"""The Shape Stacking task: a tower on two cylinders, from shapes let go one by one (spec 3 to 6).
+
+The observation is what a camera sees after every settling, the last four pictures of it.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+
+from envs_mjx.shape_stacking import rules, scene
+from envs_mjx.shape_stacking.camera import FRAME_SIZE, render, task_camera
+from envs_mjx.shape_stacking.engines import Engine, make_engine
+from envs_mjx.shape_stacking.rules import REWARD_VARIANTS, Bodies
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+from jaxnew.environment import Action, ActionSpec, Environment, Info, ObservationSpec, Transition
+
+STACK_SIZE = 4
+POSITION_DIMS = (0, 1, 2)
+
+
+@struct.dataclass
+class StackingParams:
+    """Numbers of the task; traced.
+
+    Attributes:
+      max_actions: int32[] actions after which an episode is cut, at most 10: a body of the pool for
+        each.
+    """
+
+    max_actions: jax.Array | int = scene.NUM_PLACEMENTS
+
+
+@struct.dataclass
+class StackingState:
+    """One episode.
+
+    Attributes:
+      bodies: the two start cylinders, then what was placed by action k in slot k + 2.
+      frames: uint8[84, 84, 4] the last pictures, newest last; zeros before the first.
+      num_actions: int32[] so far.
+      num_repeats: int32[] of them that named a shape which had been placed.
+      max_height: f32[] largest height of the tower after any action so far, m.
+    """
+
+    bodies: Bodies
+    frames: jax.Array
+    num_actions: jax.Array
+    num_repeats: jax.Array
+    max_height: jax.Array
+
+
+class ShapeStacking(Environment[StackingState, StackingParams]):
+    """Build a high tower.
+
+    Actions: 810 shapes, `action.id`, let go above the tower (`rules.drop_height`) at
+      `action.position` in metres, clipped to [-1, 1]; `action.stop` ends the episode and places
+      nothing. A shape that was placed before in the episode, or an id that does not exist, places
+      nothing and uses the action up. After every action 3 s are simulated.
+    Observation: uint8[84, 84, 4] gray pictures after the last four settlings, newest last.
+    Reward: `rules.tower_reward` at the end of an episode, else 0.
+    Ends: `terminated` by a stop, or where the simulation left the finite or plausible numbers, with
+      reward 0 then; `truncated` after `max_actions`.
+    Starts: two equal cylinders at rest (spec 3), drawn anew.
+    Parameters: `StackingParams`.
+    Info: `final_height` f32[] height of the highest origin above the table, m; `max_height` f32[]
+      the same, largest of the episode so far; `num_placed`, `num_repeats`, `episode_length` int32[]
+      so far; `is_stopped`, `has_failed` (the simulation), `invalid_action` bool[] of this step;
+      from `step` also `final_observation` uint8[84, 84, 4].
+
+    Attributes:
+      engine: what simulates.
+      position_dim: coordinates of a position: 0 (always at x = y = 0), 1 (x) or 2 (x and y).
+    """
+
+    name = "ShapeStacking-v0"
+    episode_metrics = (
+        "final_height",
+        "max_height",
+        "episode_length",
+        "num_placed",
+        "num_repeats",
+        "is_stopped",
+        "has_failed",
+    )
+
+    def __init__(
+        self,
+        physics: str | Engine = "auto",
+        position_dim: int = 1,
+        reward_variant: str = "release",
+        has_shadows: bool = False,
+    ) -> None:
+        """
+        Args:
+          physics: an engine, or its name, see `engines.make_engine`.
+          position_dim: 0, 1 or 2; the camera of 2 looks down on the table (spec 6.1).
+          reward_variant: `release` or `paper`, see `rules.tower_reward`.
+          has_shadows: draw the shadows of the two spots; pictures then take about 2.5 times as
+            long.
+
+        Raises:
+          ValueError: an argument is none of what is allowed.
+        """
+        if position_dim not in POSITION_DIMS:
+            raise ValueError(f"position_dim={position_dim} must be one of {POSITION_DIMS}.")
+        if reward_variant not in REWARD_VARIANTS:
+            raise ValueError(f"reward_variant={reward_variant!r} must be one of {REWARD_VARIANTS}.")
+        self.engine = make_engine(physics) if isinstance(physics, str) else physics
+        self.position_dim = position_dim
+        self._reward_variant, self._has_shadows = reward_variant, has_shadows
+
+    @property
+    def default_params(self) -> StackingParams:
+        """Ten actions."""
+        return StackingParams(jnp.int32(scene.NUM_PLACEMENTS))
+
+    @property
+    def action_spec(self) -> ActionSpec:
+        """810 shapes, `position_dim` coordinates, and a stop."""
+        return ActionSpec(NUM_SHAPES, self.position_dim, has_stop=True)
+
+    def observation_spec(self, params: StackingParams) -> ObservationSpec:
+        """uint8[84, 84, 4]."""
+        del params
+        shape = (FRAME_SIZE, FRAME_SIZE, STACK_SIZE)
+        return ObservationSpec(shape=shape, dtype=jnp.uint8, low=0, high=255)
+
+    def max_episode_steps(self, params: StackingParams) -> int:
+        """`max_actions`; `params` must be concrete.
+
+        Raises:
+          ValueError: it is not in 1..10.
+        """
+        max_actions = int(params.max_actions)
+        if not 1 <= max_actions <= scene.NUM_PLACEMENTS:
+            raise ValueError(f"max_actions={max_actions} must be 1 to {scene.NUM_PLACEMENTS}.")
+        return max_actions
+
+    def reset_env(
+        self, key: jax.Array, params: StackingParams
+    ) -> tuple[jax.Array, StackingState]:
+        """Two cylinders at rest (spec 3); consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
+        del params
+        key_cylinder, key_center, key_gap = jax.random.split(key, 3)
+        cylinder = jax.random.choice(key_cylinder, jnp.array(rules.START_CYLINDERS, jnp.int32))
+        low, high = rules.START_CENTER
+        center = jax.random.uniform(key_center, (), jnp.float32, low, high)
+        low, high = rules.START_GAP
+        gap = jax.random.uniform(key_gap, (), jnp.float32, low, high)
+        return self.start_from(rules.start(cylinder, center, gap))
+
+    def start_from(self, bodies: Bodies) -> tuple[jax.Array, StackingState]:
+        """Starts an episode from a scene of one's own, such as one of `rules.start`."""
+        # Only cylinders are there, which are far faster to draw alone.
+        picture = self._picture(bodies, scene.NUM_START_CYLINDERS)
+        frames = jnp.zeros((FRAME_SIZE, FRAME_SIZE, STACK_SIZE), jnp.uint8)
+        frames = frames.at[:, :, -1].set(picture)
+        none = jnp.int32(0)
+        return frames, StackingState(bodies, frames, none, none, rules.tower_height(bodies))
+
+    def step_env(
+        self, key: jax.Array, state: StackingState, action: Action, params: StackingParams
+    ) -> Transition:
+        """One action and 3 s, without auto-reset (spec 4).
+
+        Args:
+          key: not used; nothing is random.
+          state: of an episode in progress; what follows an end is undefined.
+          action: `id` int32[], `position` f32[position_dim], `stop` bool[].
+
+        Returns:
+          (obs uint8[84, 84, 4], state, reward f32[], terminated bool[], truncated bool[], info).
+
+        Raises:
+          ValueError: the position has another number of coordinates.
+        """
+        del key
+        stop = jnp.asarray(action.stop, bool)
+        is_valid = (action.id >= 0) & (action.id < NUM_SHAPES)
+        placed_ids = state.bodies.shape_ids[scene.NUM_START_CYLINDERS :]
+        is_repeat = ~stop & is_valid & (placed_ids == action.id).any()
+        places = ~stop & is_valid & ~is_repeat
+        bodies, ok = self._after(state, action, places)
+
+        height = rules.tower_height(bodies)
+        next_state = StackingState(
+            bodies=bodies,
+            frames=jnp.concatenate(
+                [state.frames[:, :, 1:], self._picture(bodies)[:, :, None]], axis=-1
+            ),
+            num_actions=state.num_actions + 1,
+            num_repeats=state.num_repeats + is_repeat,
+            max_height=jnp.maximum(state.max_height, height),
+        )
+        terminated = stop | ~ok
+        truncated = ~terminated & (next_state.num_actions >= params.max_actions)
+        reward = jnp.where(
+            ok & (terminated | truncated), rules.tower_reward(bodies, self._reward_variant), 0.0
+        )
+        info: Info = {
+            "final_height": height,
+            "max_height": next_state.max_height,
+            "episode_length": next_state.num_actions,
+            "num_placed": jnp.sum(bodies.shape_ids[scene.NUM_START_CYLINDERS :] >= 0),
+            "num_repeats": next_state.num_repeats,
+            "is_stopped": stop,
+            "has_failed": ~ok,
+            "invalid_action": ~is_valid,
+        }
+        return next_state.frames, next_state, reward, terminated, truncated, info
+
+    def _after(
+        self, state: StackingState, action: Action, places: jax.Array
+    ) -> tuple[Bodies, jax.Array]:
+        """The bodies at rest after the action, and whether the simulation held.
+
+        Of a simulation that failed, they are the bodies before the action.
+        """
+        slot = scene.NUM_START_CYLINDERS + state.num_actions
+        placed = rules.place(state.bodies, slot, action.id, self._position(action))
+        before = jax.tree.map(lambda new, old: jnp.where(places, new, old), placed, state.bodies)
+        qpos, qvel, ok = self.engine.settle(before.shape_ids, before.qpos, before.qvel)
+        after = Bodies(before.shape_ids, qpos, qvel)
+        return jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, state.bodies), ok
+
+    def _position(self, action: Action) -> jax.Array:
+        """f32[2] x and y, m; those that the action does not set are 0."""
+        if action.position.shape != (self.position_dim,):
+            raise ValueError(
+                f"The position is f32{list(action.position.shape)}, and {self.name} with "
+                f"position_dim={self.position_dim} takes f32[{self.position_dim}]."
+            )
+        position = jnp.clip(jnp.asarray(action.position, jnp.float32), -1.0, 1.0)
+        return jnp.zeros(2).at[: self.position_dim].set(position)
+
+    def _picture(self, bodies: Bodies, num_bodies: int = scene.NUM_SLOTS) -> jax.Array:
+        """uint8[84, 84] of the first bodies."""
+        return render(
+            bodies.shape_ids[:num_bodies],
+            bodies.qpos[:num_bodies, :3],
+            bodies.qpos[:num_bodies, 3:],
+            task_camera(self.position_dim),
+            has_shadows=self._has_shadows,
+        )
