@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
-from dataclasses import dataclass, make_dataclass, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -125,14 +126,19 @@ def machinery_of(
     return HostMachinery(learner, HostEvaluator(environments, method, *sizes), task.host)
 
 
+def in_group(assignments: Sequence[str], name: str) -> tuple[list[str], list[str]]:
+    """Those of the form `name.FIELD=value`, and the others."""
+    groups = [a.partition("=")[0].strip().split(".")[0] for a in assignments]
+    mine = [a for a, group in zip(assignments, groups, strict=True) if group == name]
+    return mine, [a for a, group in zip(assignments, groups, strict=True) if group != name]
+
+
 def pool_assignments(assignments: Sequence[str]) -> tuple[list[str], list[str]]:
     """Those of the form `pool.FIELD=value`, which say how a run is computed, and the others.
 
     The others say what a run is and belong to its config.
     """
-    groups = [a.partition("=")[0].strip().split(".")[0] for a in assignments]
-    mine = [a for a, group in zip(assignments, groups, strict=True) if group == "pool"]
-    return mine, [a for a, group in zip(assignments, groups, strict=True) if group != "pool"]
+    return in_group(assignments, "pool")
 
 
 def with_pool_settings(task: Task, assignments: Sequence[str]) -> Task:
@@ -151,6 +157,31 @@ def with_pool_settings(task: Task, assignments: Sequence[str]) -> Task:
     if task.host is None or settings is None:
         kind = "has environments inside jit" if task.host is None else "has a pool without settings"
         raise UsageError(f"{mine[0]}: task {task.name} {kind}; leave out --set=pool.*.")
-    tree = make_dataclass("Settings", [("pool", type(settings))], frozen=True)
-    changed: Any = config_lib.set_paths(tree(settings), mine)
-    return replace(task, host=replace(task.host, pool_settings=changed.pool))
+    changed = _changed(settings, "pool", mine)
+    return replace(task, host=replace(task.host, pool_settings=changed))
+
+
+def with_environment_settings(task: Task, assignments: Sequence[str]) -> Task:
+    """A task whose environment is made as `environment.FIELD=value` says.
+
+    Raises:
+      UsageError: the environment has nothing to set.
+      ConfigError: there is no such field, or it takes no such value.
+    """
+    if not assignments:
+        return task
+    if task.environment_settings is None:
+        raise UsageError(
+            f"{assignments[0]}: the environment of task {task.name} has nothing to set; leave out "
+            "--set=environment.*."
+        )
+    changed = _changed(task.environment_settings, "environment", assignments)
+    fields = {field.name: getattr(changed, field.name) for field in dataclasses.fields(changed)}
+    make = partial(task.make_environment, **fields)
+    return replace(task, make_environment=make, environment_settings=changed)
+
+
+def _changed(settings: Any, name: str, assignments: Sequence[str]) -> Any:
+    """Settings, a dataclass, with `name.FIELD=value` applied."""
+    tree = dataclasses.make_dataclass("Settings", [(name, type(settings))], frozen=True)
+    return getattr(config_lib.set_paths(tree(settings), list(assignments)), name)

@@ -15,7 +15,14 @@ import numpy as np
 
 from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
 from experiments._flags import budget_of, load_task
-from experiments._machinery import DeviceMachinery, HostMachinery, machinery_of, with_pool_settings
+from experiments._machinery import (
+    DeviceMachinery,
+    HostMachinery,
+    in_group,
+    machinery_of,
+    with_environment_settings,
+    with_pool_settings,
+)
 from experiments._methods import adapted, file_name, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
@@ -42,6 +49,7 @@ class TrainConfig:
       num_clusters: training sets are drawn from half of so many clusters of the representations
         (spec method 2.2); 0 for the paper's runs, which draw from all actions.
       conditions_position: the position's head reads the chosen action (spec method 5.5).
+      environment: `environment.FIELD=value` of the task's `environment_settings`, where set.
     """
 
     task: str
@@ -59,11 +67,23 @@ class TrainConfig:
     start: str = "fresh parameters"
     num_clusters: int = 0
     conditions_position: bool = False
+    environment: tuple[str, ...] = ()
 
     @classmethod
     def from_plain(cls, plain: dict[str, Any]) -> TrainConfig:
         """The config of a run directory; fields that it is too old for are as they were then."""
-        return config_lib.from_dict(cls, {"num_clusters": 0, "conditions_position": False, **plain})
+        absent = {"num_clusters": 0, "conditions_position": False, "environment": []}
+        return config_lib.from_dict(cls, {**absent, **plain})
+
+    def with_set(self, assignments: Sequence[str]) -> TrainConfig:
+        """A copy with every `path.to.field=value` applied; one of the environment is kept as text.
+
+        Raises:
+          ConfigError: see `config.set_paths`.
+        """
+        environment, others = in_group(assignments, "environment")
+        changed = config_lib.set_paths(self, others)
+        return replace(changed, environment=(*self.environment, *environment))
 
     @classmethod
     def of(
@@ -132,6 +152,7 @@ class Trainer:
         Raises:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
+        task = with_environment_settings(task, config.environment)
         action_spec = task.action_spec
         method = method_of(
             config.method,
@@ -271,9 +292,8 @@ def train_policy(
     """
     task = domain.task
     budget: StageTwoBudget = budget_of(task.stage_two, budget_name, "Stage two")
-    config = config_lib.set_paths(
-        TrainConfig.of(domain, method, representation, table, budget, seed), assignments or []
-    )
+    config = TrainConfig.of(domain, method, representation, table, budget, seed)
+    config = config.with_set(assignments or [])
     trainer = Trainer.of(config, task, domain.split, table, num_workers)
     name = f"{file_name(method)}-{Path(representation).name.removesuffix('.npz')}"
     path = workdir or domain.folder(runs) / f"{name}-{domain.split_name}-{budget_name}-{seed}"

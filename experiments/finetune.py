@@ -53,17 +53,9 @@ def main() -> None:
     pool, assignments = pool_assignments(flag.SET.value)
     source_run, source, split = load_trainer(source_path, flag.WORKERS.value, pool)
     table = RepresentationTable.load(source_path / TABLE_FILE)
-    config = config_lib.set_paths(
-        config_of(
-            source.config,
-            source.task,
-            split,
-            flag.BUDGET.value,
-            SCRATCH.value,
-            flag.SEED.value,
-        ),
-        assignments,
-    )
+    config = config_of(
+        source.config, source.task, split, flag.BUDGET.value, SCRATCH.value, flag.SEED.value
+    ).with_set(assignments)
     trainer = Trainer.of(config, source.task, split, table, flag.WORKERS.value)
     state = trainer.init()
     if not SCRATCH.value:

@@ -247,10 +247,8 @@ def main() -> None:
     name = flag.REPRESENTATION.value
     variant_of(flag.METHOD.value)  # Before a representation is trained for it.
     table = find_table(domain, runs, name, REPRESENTATION_BUDGET.value or flag.BUDGET.value)
-    base = config_lib.set_paths(
-        TrainConfig.of(domain, flag.METHOD.value, name, table, budget, flag.SEED.value),
-        flag.SET.value,
-    )
+    base = TrainConfig.of(domain, flag.METHOD.value, name, table, budget, flag.SEED.value)
+    base = base.with_set(flag.SET.value)
     configs = member_configs(base, parse_seeds(SEEDS.value), VARY.value)
     trainer = Trainer.of(configs[0], task, domain.split, table)
     sweep = Sweep.of(trainer, configs, jax.devices(), AT_ONCE.value)

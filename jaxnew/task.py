@@ -290,7 +290,10 @@ class Task:
       play: recordings of actions, or None for a domain whose representations are given.
       more_plays: recordings of other kinds of the same actions; their modalities have other names.
       stage_one, stage_two: presets by budget.
-      make_environment: the environment where it runs inside jit, made when first needed; else
+      make_environment: the environment where it runs inside jit, made when first needed, from no
+        arguments or from any fields of `environment_settings`; else
+      environment_settings: frozen dataclass, what can be set of it with
+        `--set=environment.FIELD=value`. None: there is nothing to set.
       host: the environments on the host.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
       validation_groups: by split, `universe -> label int[A] of every action`: while training,
@@ -318,7 +321,8 @@ class Task:
     make_universe: Callable[[], ActionUniverse]
     splits: Mapping[str, Callable[[ActionUniverse, int], ActionSplit]]
     stage_two: Mapping[str, StageTwoBudget]
-    make_environment: Callable[[], Environment] = _no_environment
+    make_environment: Callable[..., Environment] = _no_environment
+    environment_settings: Any = None
     host: HostDomain | None = None
     play: Play | None = None
     more_plays: tuple[Play, ...] = ()

@@ -138,9 +138,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
             raise ValueError(f"max_actions={max_actions} must be 1 to {scene.NUM_PLACEMENTS}.")
         return max_actions
 
-    def reset_env(
-        self, key: jax.Array, params: StackingParams
-    ) -> tuple[jax.Array, StackingState]:
+    def reset_env(self, key: jax.Array, params: StackingParams) -> tuple[jax.Array, StackingState]:
         """Two cylinders at rest (spec 3); consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
         del params
         key_cylinder, key_center, key_gap = jax.random.split(key, 3)

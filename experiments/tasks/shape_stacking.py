@@ -6,9 +6,10 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from operator import attrgetter
+from typing import Literal
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
 from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block
@@ -27,6 +28,16 @@ from jaxnew.task import (
     StageTwoBudget,
     Task,
 )
+
+
+@dataclass(frozen=True)
+class StackingSettings:
+    """What can be set with `--set=environment.FIELD=value`; see `ShapeStacking`."""
+
+    physics: Literal["auto", "mjx", "mujoco"] = "auto"
+    reward_variant: Literal["release", "paper"] = "release"
+    has_shadows: bool = False
+
 
 # Spec method 3, column Stacking: 60,000 steps on 32 shapes with 52 of 1,024 pictures each.
 _HVAE = RepresentationConfig(
@@ -181,6 +192,7 @@ def _task(variant: str, position_dim: int, paper_variant: str) -> Task:
     return Task(
         name=f"shape_stacking{variant}",
         make_environment=partial(ShapeStacking, position_dim=position_dim),
+        environment_settings=StackingSettings(),
         make_universe=shape_universe,
         splits={name: partial(_published, name) for name in ("default", "full")},
         play=_PLAY,

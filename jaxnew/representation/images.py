@@ -79,8 +79,8 @@ def transposed_convolution(x: jax.Array, kernel: jax.Array, padding: int) -> jax
         # One product: as an einsum into the final order, XLA takes a quarter longer on a CPU.
         columns = jnp.moveaxis(kernel, 2, 0).reshape(channels, -1)
         patches = (x.reshape(-1, channels) @ columns).reshape(batch, height, width, 2, 2, -1)
-        total = jnp.swapaxes(patches, 2, 3).reshape(batch, 2 * height, 2 * width, -1)
-        return _without_border(total, padding)
+        image = jnp.swapaxes(patches, 2, 3).reshape(batch, 2 * height, 2 * width, -1)
+        return _without_border(image, padding)
     products = jnp.einsum("bhwc,ijco->ijbhwo", x, kernel)
     total = None
     for i in range(size):

@@ -5,6 +5,7 @@ Each engine is a module of its own, imported by its name, since simulators take 
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import NamedTuple, Protocol
 
 import jax
@@ -83,8 +84,9 @@ def check_state(
         )
 
 
+@lru_cache(maxsize=4)
 def make_engine(physics: str = "auto") -> Engine:
-    """An engine by its name.
+    """An engine by its name; the same one for every caller, since it keeps nothing.
 
     Args:
       physics: `mujoco`: MuJoCo's C engine, on the host. `auto`: the same.

@@ -127,6 +127,8 @@ class MujocoC:
         start_qpos = np.where(is_unused, parked, qpos).astype(np.float64)
         start_qvel = np.where(is_unused, 0.0, qvel).astype(np.float64)
         sound = np.flatnonzero(is_plausible(start_qpos, start_qvel))
+        if not sound.size:
+            return np.zeros(len(ids), bool)
         end_qpos, end_qvel, ran = self._worlds.run(
             ids[sound], start_qpos[sound], start_qvel[sound], self.settle_steps
         )
