@@ -82,8 +82,10 @@ class TrainConfig:
           ConfigError: see `config.set_paths`.
         """
         environment, others = in_group(assignments, "environment")
+        settings = [text.partition("=") for text in (*self.environment, *environment)]
+        by_path = {path.strip(): equals + value.strip() for path, equals, value in settings}
         changed = config_lib.set_paths(self, others)
-        return replace(changed, environment=(*self.environment, *environment))
+        return replace(changed, environment=tuple(sorted(map("".join, by_path.items()))))
 
     @classmethod
     def of(

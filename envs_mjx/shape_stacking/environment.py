@@ -152,7 +152,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     def start_from(self, bodies: Bodies) -> tuple[jax.Array, StackingState]:
         """Starts an episode from a scene of one's own, such as one of `rules.start`."""
         # Only cylinders are there, which are far faster to draw alone.
-        picture = self._picture(bodies, scene.NUM_START_CYLINDERS)
+        picture = self.picture(bodies, scene.NUM_START_CYLINDERS)
         frames = jnp.zeros((FRAME_SIZE, FRAME_SIZE, STACK_SIZE), jnp.uint8)
         frames = frames.at[:, :, -1].set(picture)
         none = jnp.int32(0)
@@ -186,7 +186,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         next_state = StackingState(
             bodies=bodies,
             frames=jnp.concatenate(
-                [state.frames[:, :, 1:], self._picture(bodies)[:, :, None]], axis=-1
+                [state.frames[:, :, 1:], self.picture(bodies)[:, :, None]], axis=-1
             ),
             num_actions=state.num_actions + 1,
             num_repeats=state.num_repeats + is_repeat,
@@ -233,8 +233,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         position = jnp.clip(jnp.asarray(action.position, jnp.float32), -1.0, 1.0)
         return jnp.zeros(2).at[: self.position_dim].set(position)
 
-    def _picture(self, bodies: Bodies, num_bodies: int = scene.NUM_SLOTS) -> jax.Array:
-        """uint8[84, 84] of the first bodies."""
+    def picture(self, bodies: Bodies, num_bodies: int = scene.NUM_SLOTS) -> jax.Array:
+        """The picture uint8[84, 84] that an observation shows, of the first bodies only."""
         return render(
             bodies.shape_ids[:num_bodies],
             bodies.qpos[:num_bodies, :3],

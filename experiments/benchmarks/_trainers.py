@@ -16,6 +16,7 @@ from jaxnew.ppo import TrainState
 from jaxnew.ppo.objective import Minibatch
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.sampling import draw_sets
+from jaxnew.task import Task
 
 REPRESENTATION_SIZE = 16  # Of the paper's HVAE in Grid World, and of products (spec method 3).
 
@@ -23,19 +24,19 @@ REPRESENTATION_SIZE = 16  # Of the paper's HVAE in Grid World, and of products (
 def make_trainer(
     set_size: int = 0,
     seed: int = 31,
-    task: str = "grid_world",
+    task: str | Task = "grid_world",
     method: str = "ours",
     representation_size: int = REPRESENTATION_SIZE,
+    budget: str = "paper",
 ) -> Trainer:
-    """A run at the paper's shapes on a random table; with `--quick` 4 x 16 steps and sets of 5.
+    """A run of a budget on a random table; with `--quick` 4 x 16 steps and sets of 5.
 
     The table holds random numbers: what a representation says does not change what it costs.
 
     Args:
       set_size: actions in a set; 0 for the task's.
     """
-    domain = Domain.of(load_task(task), None)
-    budget = domain.task.stage_two["paper"]
+    domain = Domain.of(load_task(task) if isinstance(task, str) else task, None)
     num_actions = domain.universe.num_actions
     vectors = np.random.default_rng(0).normal(size=(num_actions, representation_size))
     table = RepresentationTable(
@@ -44,7 +45,7 @@ def make_trainer(
         universe_hash=domain.universe.hash,
         source="random numbers",
     )
-    config = TrainConfig.of(domain, method, "random", table, budget, seed)
+    config = TrainConfig.of(domain, method, "random", table, domain.task.stage_two[budget], seed)
     ppo = config.ppo
     rollout = replace(ppo.rollout, set_size=set_size or ppo.rollout.set_size)
     if m.QUICK.value:

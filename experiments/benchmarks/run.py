@@ -25,6 +25,7 @@ SUBJECTS = (
     "create",
     "host_training",
     "stacking",
+    "stacking_training",
 )
 ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
 
