@@ -166,6 +166,19 @@ class Box:
         return jnp.all((value >= self.low) & (value <= self.high))
 
 
+def checked_ids(env: Environment, ids: np.ndarray) -> np.ndarray:
+    """int32[n] `ids` as a fixed list of actions of `env`.
+
+    Raises:
+      ValueError: `ids` is empty or names an action that `env` does not have.
+    """
+    ids = np.asarray(ids, np.int32)
+    num_actions = env.action_spec.num_actions
+    if ids.ndim != 1 or ids.size == 0 or ids.min() < 0 or ids.max() >= num_actions:
+        raise ValueError(f"ids must be a non-empty list of ids in 0..{num_actions - 1}, got {ids}.")
+    return ids
+
+
 class FixedActionSet:
     """`env` with one fixed list of action ids: a plain integer-action environment.
 
@@ -180,12 +193,8 @@ class FixedActionSet:
     """
 
     def __init__(self, env: Environment, ids: np.ndarray) -> None:
-        ids = np.asarray(ids, np.int32)
+        ids = checked_ids(env, ids)
         spec = env.action_spec
-        if ids.ndim != 1 or ids.size == 0 or ids.min() < 0 or ids.max() >= spec.num_actions:
-            raise ValueError(
-                f"ids must be a non-empty list of ids in 0..{spec.num_actions - 1}, got {ids}."
-            )
         if spec.position_dim or spec.has_stop:
             raise ValueError(
                 f"{env.name} actions have a position or a stop bit, so they are not one integer."
