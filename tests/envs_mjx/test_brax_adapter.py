@@ -20,6 +20,9 @@ from flax import struct
 from envs_mjx.brax_adapter import PIXELS, BraxEnvironment, trainers
 from envs_mjx.grid_world import GridWorld
 from envs_mjx.grid_world.environment import GridWorldParams, encode_layout
+from envs_mjx.recommender import Recommender
+from envs_mjx.shape_stacking import ShapeStacking
+from envs_mjx.shape_stacking.engines import Settled
 from jaxnew.environment import Action, ActionSpec, Environment, ObservationSpec, Transition
 from tests.test_import_rules import MODULES, loaded_after
 
@@ -221,6 +224,40 @@ def test_brax_wrappers_see_the_episodes_of_the_house(
     assert seen["is_cut"].any() == is_cutting
     assert seen["terminated"].any()
     assert seen["truncated"].any() == (not is_cutting)
+
+
+class Still:
+    """A physics engine that moves nothing."""
+
+    name, settle_steps = "still", 1
+
+    def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
+        return Settled(qpos, qvel, jnp.bool_(True))
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize(
+    ("house", "num_actions"), [(Recommender(), 10_000), (ShapeStacking(Still()), 810)]
+)
+def test_the_other_environments_too(house: Environment, num_actions: int) -> None:
+    env = BraxEnvironment(house, range(0, num_actions, num_actions // 30))
+    actions = random_actions(env, 0)[:12, :3]
+    if house.action_spec.has_stop:
+        actions[..., -1] -= 0.75
+    first, after = brax_rollout(training.wrap(env, 9), actions, 1)
+    first_obs, seen = house_rollout(env, house, actions, 1, 9)
+    if isinstance(env.observation_size, dict):
+        first, after = (state.replace(obs=state.obs[PIXELS]) for state in (first, after))
+        after.info["final_observation"] = after.info["final_observation"][PIXELS]
+    np.testing.assert_array_equal(first.obs, first_obs)
+    np.testing.assert_array_equal(after.obs, seen["obs"])
+    np.testing.assert_array_equal(after.info["final_observation"], seen["final_observation"])
+    np.testing.assert_array_equal(after.reward, seen["reward"])
+    ends = seen["terminated"] | seen["truncated"]
+    np.testing.assert_array_equal(after.done, ends | seen["is_cut"])
+    np.testing.assert_array_equal(after.info["truncation"], seen["is_cut"])
+    assert seen["is_cut"].any()
+    assert after.reward.any()
 
 
 @pytest.mark.contract
