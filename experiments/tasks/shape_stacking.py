@@ -89,12 +89,12 @@ _STAGE_ONE = {
     ),
     "laptop": _stage_one(
         64,
-        replace(_HVAE, num_steps=8000, recordings_per_action=4, actions_per_batch=16),
+        replace(_HVAE, num_steps=5000, recordings_per_action=4, actions_per_batch=16),
         200,
-        "about 50 minutes and 1.1 GB on disk on one core",
+        "50 minutes on one core, and 1.1 GB on disk",
     ),
     "paper": _stage_one(
-        1024, _HVAE, 500, "9 days on two cores, from the rate of `laptop`", stores_drawn=False
+        1024, _HVAE, 500, "10 days on one core, from the rate of `laptop`", stores_drawn=False
     ),
 }
 
