@@ -5,8 +5,9 @@
 
 RUN is a run of `train` with `--method=ours` or `--method=nearest-neighbour`. Its policy is trained
 with all test actions as one fixed set; the learning rate starts anew. From a utility policy
-everything is kept; from a discrete policy all but the head, which has one logit per action. The
-running statistics of observations are kept and frozen. `--scratch` keeps nothing.
+everything is kept; from a discrete policy all but its categorical heads: that of the actions, which
+has one logit per action, and that of the stop bit. The running statistics of observations are kept
+and frozen. `--scratch` keeps nothing.
 """
 
 from __future__ import annotations
@@ -119,10 +120,16 @@ def config_of(
 
 
 def warm_start(state: TrainState, source: TrainState, trainer: Trainer) -> TrainState:
-    """A fresh state with the parameters and the observation statistics of a trained one."""
+    """A fresh state with the parameters and the observation statistics of a trained one.
+
+    Of a discrete policy the categorical heads stay fresh (spec method 9).
+    """
     params: dict[str, Any] = jax.tree.map(lambda x: x, source.params)
-    if "policy" in params and "logits" in params["policy"]:
-        params["policy"] = {**params["policy"], "logits": state.params["policy"]["logits"]}
+    if "logits" in params.get("policy", {}):
+        params["policy"]["logits"] = state.params["policy"]["logits"]
+        heads = params.get("auxiliary", {}).get("heads", {})
+        if "stop" in heads:
+            heads["stop"] = state.params["auxiliary"]["heads"]["stop"]
     state = dataclasses.replace(state, params=params)
     statistics = source.rollout.observation_statistics
     return trainer.machinery.restarted(state, trainer.training_pool, statistics)
