@@ -14,7 +14,7 @@ import os
 import subprocess
 import sys
 import traceback
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +35,7 @@ def run_several(
     *,
     probe: str = "contextlib:nullcontext",
     may_fail: bool = False,
+    environment: Mapping[str, str] = ENVIRONMENT,
 ) -> list[str]:
     """What `python -m experiments.MODULE JOB` prints for each job, all of them in one new process.
 
@@ -43,21 +44,44 @@ def run_several(
       jobs: the flags of each.
       probe: `package.module:NAME` of `job -> context manager`, in which the job is done.
       may_fail: a job's output may end with a traceback; later jobs are done all the same.
+      environment: variables of the process.
     """
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.experiments.several", module, probe],
-        cwd=ROOT,
-        env={**os.environ, **ENVIRONMENT},
-        input=json.dumps([[str(flag) for flag in job] for job in jobs]),
-        capture_output=True,
-        text=True,
-        timeout=1800,
-        check=False,
-    )
-    assert done.returncode == 0, done.stdout + done.stderr
-    outputs: list[str] = json.loads(done.stdout)
+    process = start_several(module, jobs, probe=probe, environment=environment)
+    outputs = finish_several(process)
     failed = [output for output in outputs if _FAILED in output]
     assert may_fail or not failed, "\n".join(failed)
+    return outputs
+
+
+def start_several(
+    module: str,
+    jobs: Sequence[Sequence[str | Path]],
+    *,
+    probe: str,
+    environment: Mapping[str, str] = ENVIRONMENT,
+) -> subprocess.Popen[str]:
+    """The process of `run_several`, which `finish_several` waits for."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "tests.experiments.several", module, probe],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdin is not None
+    process.stdin.write(json.dumps([[str(flag) for flag in job] for job in jobs]))
+    process.stdin.close()
+    process.stdin = None  # `communicate` would flush it.
+    return process
+
+
+def finish_several(process: subprocess.Popen[str]) -> list[str]:
+    """What each job printed."""
+    stdout, stderr = process.communicate(timeout=1800)
+    assert process.returncode == 0, stdout + stderr
+    outputs: list[str] = json.loads(stdout)
     return outputs
 
 

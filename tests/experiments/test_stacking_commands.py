@@ -1,0 +1,408 @@
+"""Shape Stacking through the commands at smoke budget: train, save, reload elsewhere, evaluate.
+
+Every method, ablation, representation, split and placement variant: `stacking_runs.RUNS` gives each
+of them to a run. Most are `slow`, for their programs take long to compile and are never kept.
+"""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_library, shape_universe
+from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
+from experiments._artifacts import REPRESENTATION_SEED
+from experiments._training import load_trainer
+from jaxnew import metrics
+from jaxnew.checkpoint import Checkpointer
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.sampling import draw_sets
+from tests.experiments import stacking_runs as stacking
+from tests.experiments.commands import read_json
+from tests.experiments.create_runs import parameters, saved, timeless
+from tests.experiments.several import finish_several, run_several, start_several
+from tests.experiments.stacking_probes import EPISODES, seen
+from tests.experiments.stacking_runs import (
+    ALIKE,
+    EMBED,
+    ENVIRONMENT,
+    OTHERS,
+    RUNS,
+    WATCHED,
+    WIDTH,
+    evaluation,
+    logged,
+    means,
+)
+
+pytestmark = pytest.mark.integration
+
+NAMES = [*ALIKE, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
+ENCODERS = ("vae", "hvae-oracle", "vae-oracle")
+FIXED_SETS = ("no-place", "no-subsampling")
+# A start cylinder is 0.3 to 0.37 m high; ten of the largest shapes could be stacked up to 10 m.
+HEIGHTS = (0.3, 10.0)
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of all runs, with an encoder in it."""
+    folder = tmp_path_factory.mktemp("runs")
+    stacking.embed(folder, ["hvae"], "--frames=stored")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def encoders(runs: Path) -> Path:
+    """The same with the other encoders, and a table of the user's own."""
+    stacking.embed(runs, ENCODERS, "--frames=stored")
+    stacking.save_own_table(runs / "mine.npz")
+    return runs
+
+
+@pytest.fixture(scope="module")
+def trained_alike(runs: Path) -> dict[str, str]:
+    return stacking.train(runs, ALIKE)
+
+
+@pytest.fixture(scope="module")
+def trained_others(encoders: Path) -> dict[str, str]:
+    return stacking.train(encoders, OTHERS)
+
+
+@pytest.fixture(scope="module")
+def evaluated_alike(runs: Path, trained_alike: dict[str, str]) -> dict[str, str]:
+    assert trained_alike
+    return stacking.evaluate(runs, ALIKE)
+
+
+@pytest.fixture(scope="module")
+def evaluated_others(runs: Path, trained_others: dict[str, str]) -> dict[str, str]:
+    assert trained_others
+    return stacking.evaluate(runs, OTHERS)
+
+
+@pytest.fixture
+def trained(request: pytest.FixtureRequest, name: str) -> str:
+    """What `train` printed for a run."""
+    outputs = request.getfixturevalue("trained_alike" if name in ALIKE else "trained_others")
+    output: str = outputs[name]
+    return output
+
+
+@pytest.fixture
+def evaluated(request: pytest.FixtureRequest, name: str) -> str:
+    """What `evaluate` printed for a run."""
+    outputs = request.getfixturevalue("evaluated_alike" if name in ALIKE else "evaluated_others")
+    output: str = outputs[name]
+    return output
+
+
+def check_heights(found: dict[str, float]) -> None:
+    """Towers are no lower than a start cylinder, and none is higher than shapes can be stacked."""
+    assert HEIGHTS[0] <= found["final_height"] <= found["max_height"] + 1e-6
+    assert found["max_height"] <= HEIGHTS[1]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_is_trained_and_saved(runs: Path, trained: str, name: str) -> None:
+    run, path = RUNS[name], runs / name
+    split = run.action_split
+    updates = 2 if name == "line" else 1
+    config = read_json(path / "config.json")
+    table = RepresentationTable.load(path / "table.npz")
+    assert (config["task"], config["method"], config["split"]) == (run.task, run.method, run.split)
+    assert config["split_hash"] == split.hash
+    assert config["table_hash"] == table.hash
+    assert table.universe_hash in (shape_universe().hash, None)
+    lines = metrics.read(path)
+    assert [line["step"] for line in lines if "loss/total" in line] == [*range(1, updates + 1)]
+    assert Checkpointer(path / "checkpoints").steps("latest")[-1] == updates
+    for step in range(1, updates + 1):
+        for prefix in ("episode", "train", "validation"):
+            check_heights(logged(path, step, prefix))
+    engine = seen(trained)
+    assert engine.placed <= {*split.train.tolist(), *split.validation.tolist()}
+    assert engine.placed & {*split.train.tolist()}
+    assert engine.placed & {*split.validation.tolist()}
+    assert engine.batches == {(2,), (EPISODES,)}, "all worlds at once"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_is_evaluated_in_another_process(runs: Path, evaluated: str, name: str) -> None:
+    path, split = runs / name, RUNS[name].action_split
+    engine, found, mean = seen(evaluated), evaluation(path), means(path)
+    assert engine.placed <= {*split.train.tolist(), *split.test.tolist()}
+    assert engine.placed & {*split.test.tolist()}
+    assert (found["num_episodes"], found["num_actions"]) == (EPISODES, len(split.test))
+    assert found["set_size"] == 5
+    assert evaluation(path, "train")["set_size"] == (len(split.train) if name in FIXED_SETS else 5)
+    names = {*ShapeStacking.episode_metrics, "num_steps"}
+    assert set(mean) == names
+    for metric, row in found["metrics"].items():
+        assert row["low"] <= row["mean"] <= row["high"], metric
+    check_heights(mean)
+    assert 1.0 <= mean["num_steps"] == mean["episode_length"] <= 10.0
+    assert mean["has_failed"] == 0.0
+    # Every action places a shape, names one that is there, or stops.
+    counted = mean["num_placed"] + mean["num_repeats"] + mean["is_stopped"]
+    assert counted == pytest.approx(mean["num_steps"], abs=1e-6)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_what_is_loaded_is_what_was_saved(runs: Path, evaluated: str, name: str) -> None:
+    """The same episodes as during the training, at the best checkpoint."""
+    assert evaluated
+    path = runs / name
+    found = means(path, "train")
+    before = logged(path, evaluation(path, "train")["step"], "train")
+    assert set(found) == set(before)
+    for metric, value in before.items():
+        # Means in f32 and in f64.
+        assert found[metric] == pytest.approx(value, rel=1e-6), metric
+
+
+def test_the_encoder_describes_every_shape(runs: Path) -> None:
+    path = runs / EMBED.format("hvae")
+    table = RepresentationTable.load(path / "table.npz")
+    assert table.vectors.shape == (810, WIDTH)
+    assert len(np.unique(table.vectors, axis=0)) == 810, "no two shapes look the same"
+    config = read_json(path / "config.json")
+    assert (config["train_on"], config["split_hash"]) == ("train", published_split().hash)
+    lines = [line for line in metrics.read(path) if "loss" in line]
+    assert [line["step"] for line in lines] == [1, 2]
+    assert lines[1]["loss"] < lines[0]["loss"]
+    pictures = np.load(runs / "shape_stacking" / "pictures-1" / "recordings.npy", mmap_mode="r")
+    assert (pictures.shape, pictures.dtype) == ((810, 1, 84, 84, 3), np.uint8)
+
+
+def test_new_pictures_are_encoded_and_acted_with(
+    runs: Path, trained_alike: dict[str, str], tmp_path: Path
+) -> None:
+    """Paper algorithm 2: pictures of shapes that the encoder never saw, and nothing trained."""
+    assert trained_alike
+    ids = published_split().test[:8]
+    seeds = {"known": REPRESENTATION_SEED, "new": 7}  # Of the viewpoints.
+    tables = {name: tmp_path / f"{name}_table.npz" for name in seeds}
+    jobs = []
+    for name, seed in seeds.items():
+        views = np.tile(np.stack(viewpoints(seed, 1), axis=-1), (len(ids), 1))
+        pictures = draw_pictures(ids, views)[:, None]
+        np.savez(tmp_path / f"{name}.npz", ids=ids, recordings=pictures)
+        files = (f"--observations={tmp_path / name}.npz", f"--output={tables[name]}")
+        jobs.append((f"--checkpoint={runs / EMBED.format('hvae')}", *files))
+    stored = np.load(runs / "shape_stacking" / "pictures-1" / "recordings.npy", mmap_mode="r")
+    drawn = np.load(tmp_path / "known.npz")["recordings"]
+    # Rounded by other programs.
+    assert np.abs(drawn.astype(int) - stored[ids]).max() <= 1
+    outputs = run_several("embed", jobs, environment=ENVIRONMENT)
+    found = {name: RepresentationTable.load(path) for name, path in tables.items()}
+    own = RepresentationTable.load(runs / EMBED.format("hvae") / "table.npz").rows(np.sort(ids))
+    for output, table in zip(outputs, found.values(), strict=True):
+        assert f"8 actions, {WIDTH} numbers each" in output
+        np.testing.assert_array_equal(table.ids, np.sort(ids))
+    off = {name: np.abs(table.vectors - own).max() for name, table in found.items()}
+    assert off["known"] < 0.1 * off["new"], "the same pictures, and others"
+    job = (f"--run={runs / 'line'}", f"--table={tables['new']}", f"--episodes={EPISODES}")
+    (output,) = run_several("evaluate", [job], probe=WATCHED, environment=ENVIRONMENT)
+    assert seen(output).placed
+    assert seen(output).placed <= {*ids.tolist()}
+    result = evaluation(runs / "line", "table-new_table")
+    assert (result["num_actions"], result["num_episodes"]) == (8, EPISODES)
+    check_heights({name: row["mean"] for name, row in result["metrics"].items()})
+
+
+def test_full_split_watches_halves_of_its_classes(
+    runs: Path, trained_alike: dict[str, str]
+) -> None:
+    """Spec method 2.2: of the validation shapes, and of them only."""
+    assert trained_alike
+    _, trainer, split = load_trainer(runs / "full")
+    labels = shape_library().class_labels
+    keys = jax.random.split(jax.random.key(0), 200)
+    _, pool = trainer.watched("validation")
+    ids = np.asarray(draw_sets(keys, pool, 5).ids)
+    assert np.isin(ids, split.validation).all()
+    assert not {*labels[split.validation]} & {*labels[split.train]}
+    num_classes = [len({*labels[row]}) for row in ids]
+    assert max(num_classes) == 4, "of eight"
+    _, everything = trainer.on_split("validation", trainer.evaluator)
+    ids = np.asarray(draw_sets(keys, everything, 5).ids)
+    assert max(len({*labels[row]}) for row in ids) == 5
+    assert trainer.watched("train")[1].group_starts is None
+
+
+@pytest.mark.slow
+def test_pictures_drawn_on_demand_give_the_same_table(runs: Path, tmp_path: Path) -> None:
+    stacking.embed(tmp_path, ["hvae"], "--frames=on-demand")
+    assert not (tmp_path / "shape_stacking" / "pictures-1").exists()
+    assert (runs / "shape_stacking" / "pictures-1").exists()
+    tables = [
+        RepresentationTable.load(folder / EMBED.format("hvae") / "table.npz")
+        for folder in (runs, tmp_path)
+    ]
+    np.testing.assert_array_equal(tables[0].vectors, tables[1].vectors)
+    assert tables[0].hash == tables[1].hash
+    lines = [timeless(folder / EMBED.format("hvae")) for folder in (runs, tmp_path)]
+    assert lines[0] == lines[1]
+
+
+@pytest.mark.slow
+def test_what_methods_are_made_of(
+    runs: Path, trained_alike: dict[str, str], trained_others: dict[str, str]
+) -> None:
+    assert trained_alike
+    assert trained_others
+    config = {name: read_json(runs / name / "config.json") for name in RUNS}
+    size = {
+        name: {key: value.shape for key, value in parameters(runs / name).items()} for name in RUNS
+    }
+    entropy = {name: config[name]["hyperparameters"]["entropy_coefficient"] for name in RUNS}
+    assert {name for name, value in entropy.items() if value == 0.0} == {"no-entropy"}
+    assert {value for value in entropy.values() if value} == {0.01}
+    fixed = {name for name in RUNS if config[name]["ppo"]["rollout"]["has_fixed_set"]}
+    assert fixed == set(FIXED_SETS)
+    assert config["clusters"]["num_clusters"] == 10
+    assert all(name == "clusters" or not config[name]["num_clusters"] for name in RUNS)
+    assert size["no-entropy"] == size["full"] == size["clusters"] == size["line"]
+    assert size["no-place"]["policy.logits.kernel"] == (64, 405)
+    assert size["continuous"]["policy.mean.kernel"] == (64, WIDTH)
+    for name in ("no-place", "continuous"):
+        assert not [key for key in size[name] if key.startswith("utility")]
+    positions = {name: shapes.get("auxiliary.heads.alpha.kernel") for name, shapes in size.items()}
+    assert positions.pop("no-subsampling") == (64, 2)
+    assert {name for name, shape in positions.items() if shape is None} == {
+        "no-place",
+        "random",
+        "2d-place",
+    }
+    assert size["2d-place"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
+    assert size["2d-place"]["auxiliary.alpha.out.kernel"] == (64, 2)
+    assert {shapes["auxiliary.heads.stop.kernel"] for shapes in size.values()} == {(64, 2)}
+
+
+@pytest.mark.slow
+def test_clusters_are_of_train_shapes(runs: Path, trained_others: dict[str, str]) -> None:
+    assert trained_others
+    _, trainer, split = load_trainer(runs / "clusters")
+    assert np.asarray(trainer.training_pool.group_starts).shape == (11,), "ten clusters"
+    ids = np.asarray(trainer.training_pool.ids)[: int(trainer.training_pool.size)]
+    np.testing.assert_array_equal(np.sort(ids), split.train)
+
+
+@pytest.mark.slow
+def test_representations_are_those_that_were_asked_for(
+    runs: Path, trained_alike: dict[str, str], trained_others: dict[str, str]
+) -> None:
+    assert trained_alike
+    assert trained_others
+    used = {name: RepresentationTable.load(runs / name / "table.npz") for name in RUNS}
+    embedded = {name: run.representation for name, run in RUNS.items() if "/" in run.representation}
+    assert len(embedded) == 1 + len(ENCODERS)
+    for name, representation in embedded.items():
+        config = read_json(runs / representation / "config.json")
+        assert config["train_on"] == ("all" if "oracle" in representation else "train")
+        assert config["model"]["kind"] == ("vae" if "embed-vae" in representation else "hvae")
+        assert used[name].hash == RepresentationTable.load(runs / representation / "table.npz").hash
+        assert metrics.read(runs / representation)[-1]["step"] == 2
+    np.testing.assert_array_equal(used["continuous"].vectors, np.load(runs / "mine.npz")["vectors"])
+    gt21 = shape_universe().engineered["gt21"]
+    for name in ("no-entropy", "full", "random"):
+        np.testing.assert_array_equal(used[name].vectors, gt21)
+    assert len({table.hash for table in used.values()}) == len(RUNS) - 2, "gt21 thrice"
+    assert all(table.vectors.shape == (810, WIDTH) for table in used.values())
+    assert all(np.isfinite(table.vectors).all() for table in used.values())
+
+
+@pytest.mark.slow
+def test_finetuning_of_each_kind(
+    runs: Path, trained_alike: dict[str, str], trained_others: dict[str, str], tmp_path: Path
+) -> None:
+    """Both policies, warm and from scratch, with all test shapes as one set (spec method 9)."""
+    assert trained_alike
+    assert trained_others
+    sources = {"ours": "line", "nearest-neighbour": "no-place"}
+    kinds = [(method, start) for method in sources for start in ("warm", "scratch")]
+    jobs = []
+    for method, start in kinds:
+        flags = ("--budget=smoke", "--seed=7", *stacking.SHORT)
+        flags = (*flags, *(["--scratch"] if start == "scratch" else []))
+        workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
+        jobs.append((f"--run={runs / sources[method]}", *flags, workdir))
+    outputs = run_several("finetune", jobs, probe=WATCHED, environment=ENVIRONMENT)
+    test = published_split().test
+    for (method, start), output in zip(kinds, outputs, strict=True):
+        path = tmp_path / f"{method}-{start}"
+        config = read_json(path / "config.json")
+        assert seen(output).placed
+        assert seen(output).placed <= {*test.tolist()}
+        assert config["trained_on"] == "test"
+        assert config["method"] == {"ours": "no-subsampling"}.get(method, method)
+        assert config["start"] == {"warm": f"{method}, seed 31"}.get(start, "fresh parameters")
+        check_heights(logged(path, 1, "episode"))
+        found, source = parameters(path), parameters(runs / sources[method])
+        kept = [key for key in found if "logits" not in key and "stop" not in key]
+        moved = max(np.abs(found[key] - source[key]).max() for key in kept)
+        # Four steps of Adam by about 1e-3 each, against parameters of another seed.
+        assert (moved < 0.02) == (start == "warm")
+        if method == "nearest-neighbour":
+            assert found["policy.logits.kernel"].shape == (64, len(test))
+
+
+@pytest.mark.slow
+def test_a_run_that_was_stopped_goes_on_to_the_same_bits(
+    runs: Path, trained_alike: dict[str, str], tmp_path: Path
+) -> None:
+    """SIGTERM during or after the first update, then the same command in a new process."""
+    assert trained_alike
+    path = tmp_path / "stopped"
+    job = RUNS["line"].training(runs, path)
+    process = start_several("train", [job], probe=WATCHED, environment=ENVIRONMENT)
+    log = path / "metrics.jsonl"
+    while process.poll() is None and not (log.exists() and log.stat().st_size):
+        time.sleep(0.05)
+    process.terminate()
+    (output,) = finish_several(process)
+    assert "stopped at step 1; run again to go on" in output
+    assert Checkpointer(path / "checkpoints").steps("latest")[-1] == 1
+    (output,) = run_several("train", [job], probe=WATCHED, environment=ENVIRONMENT)
+    assert "at step 1 of 2" in output
+    calm = runs / "line"
+    for kind in ("best", "latest"):
+        assert saved(path, kind) == saved(calm, kind)
+    assert any("env_state" in leaf for leaf in saved(path, "latest"))
+    assert timeless(path) == timeless(calm)
+    assert metrics.read(path)[-1]["step"] == 2
+    assert read_json(path / "config.json") == read_json(calm / "config.json")
+
+
+@pytest.mark.slow
+def test_members_of_a_sweep_share_their_batches(
+    runs: Path, trained_alike: dict[str, str], tmp_path: Path
+) -> None:
+    """Two seeds side by side: the engine gets the worlds of both at once."""
+    assert trained_alike
+    run = RUNS["no-entropy"]
+    flags = [flag for flag in run.training(runs, tmp_path / "sweep") if "seed" not in flag]
+    job = (*flags, "--seeds=31,41", "--members_at_once=2")
+    probe = f"{WATCHED}_on_one_core"
+    (output,) = run_several("sweep", [job], probe=probe, environment=ENVIRONMENT)
+    engine = seen(output)
+    assert engine.batches == {(2, 2), (2, EPISODES)}
+    split = published_split()
+    assert engine.placed <= {*split.train.tolist(), *split.validation.tolist()}
+    members = [tmp_path / "sweep" / "members" / name for name in ("000", "001")]
+    assert [read_json(path / "config.json")["seed"] for path in members] == [31, 41]
+    assert read_json(members[0] / "config.json") == read_json(runs / "no-entropy" / "config.json")
+    first, second = (logged(path, 1, "episode") for path in members)
+    check_heights(first)
+    check_heights(second)
+    assert first["final_height"] != second["final_height"]
+    alone = logged(runs / "no-entropy", 1, "episode")
+    # The same episodes up to rounding, which a falling tower magnifies.
+    assert first["episode_length"] == alone["episode_length"]
+    assert first["final_height"] == pytest.approx(alone["final_height"], abs=0.02)
