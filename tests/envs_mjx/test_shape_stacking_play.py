@@ -11,7 +11,7 @@ import pytest
 
 from envs_mjx.shape_stacking import play
 from envs_mjx.shape_stacking.camera import orbit_camera, render_rgb
-from envs_mjx.shape_stacking.play import PICTURE_SHAPE, record_block, viewpoints
+from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block, viewpoints
 from envs_mjx.shape_stacking.shapes import shape_library
 
 pytestmark = pytest.mark.unit
@@ -45,9 +45,17 @@ def test_repeated_views_as_in_the_original() -> None:
         viewpoints(0, 4, num_distinct_views=0)
 
 
+def recorded(seed: int, ids: np.ndarray, num_recordings: int, **options: int) -> np.ndarray:
+    """uint8[n, S, 84, 84, 3] what is recorded of shapes, drawn."""
+    views = record_block(seed, ids, num_recordings, **options)
+    assert (views.shape, views.dtype) == ((len(ids), num_recordings, 2), np.float32)
+    pictures = draw_pictures(np.repeat(ids, num_recordings), views.reshape(-1, 2))
+    return pictures.reshape(len(ids), num_recordings, *PICTURE_SHAPE)
+
+
 def test_recordings_are_the_shape_alone_from_the_shared_viewpoints() -> None:
     ids, num_recordings = np.array([500, 77], np.int32), 5
-    block = record_block(5, ids, num_recordings)
+    block = recorded(5, ids, num_recordings)
     assert block.shape == (2, num_recordings, *PICTURE_SHAPE)
     assert block.dtype == np.uint8
     azimuth, height = viewpoints(5, num_recordings)
@@ -68,12 +76,12 @@ def test_recordings_are_the_shape_alone_from_the_shared_viewpoints() -> None:
 
 
 def test_recordings_of_a_shape_do_not_depend_on_the_others() -> None:
-    block = record_block(0, np.array([10, 400, 790], np.int32), 3)
-    others = record_block(0, np.array([790, 10, 20], np.int32), 3)
+    block = recorded(0, np.array([10, 400, 790], np.int32), 3)
+    others = recorded(0, np.array([790, 10, 20], np.int32), 3)
     np.testing.assert_array_equal(others[:2], block[[2, 0]])
     assert not np.array_equal(others[2], block[0])
-    assert not np.array_equal(record_block(1, np.array([10, 400, 790]), 3), block)
-    repeated = record_block(0, np.array([10, 400, 790]), 3, num_distinct_views=2)
+    assert not np.array_equal(recorded(1, np.array([10, 400, 790]), 3), block)
+    repeated = recorded(0, np.array([10, 400, 790]), 3, num_distinct_views=2)
     np.testing.assert_array_equal(repeated[:, 2], repeated[:, 0])
     np.testing.assert_array_equal(repeated[:, :2], block[:, :2])
 
@@ -81,12 +89,12 @@ def test_recordings_of_a_shape_do_not_depend_on_the_others() -> None:
 def test_views_drawn_side_by_side_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
     """As accelerators draw them; seven views do not fill two batches of four."""
     ids = np.array([480], np.int32)
-    block = record_block(2, ids, 7)
+    block = recorded(2, ids, 7)
     monkeypatch.setattr(play, "_VIEWS_AT_ONCE", {jax.default_backend(): 4})
-    difference = np.abs(record_block(2, ids, 7).astype(int) - block)
+    difference = np.abs(recorded(2, ids, 7).astype(int) - block)
     assert (difference.max(-1) > 1).sum() <= 7 * 3
 
 
 def test_shapes_that_do_not_exist() -> None:
     with pytest.raises(ValueError, match=r"Shape 810 does not exist; ids are 0\.\.809"):
-        record_block(0, np.array([3, 810]), 2)
+        draw_pictures(np.array([3, 810]), np.zeros((2, 2), np.float32))
