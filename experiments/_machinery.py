@@ -117,7 +117,8 @@ def machinery_of(
     if task.host is None:
         env = task.make_environment()
         params = env.default_params
-        evaluator = Evaluator(env, params, method, *sizes, rollout.normalize_observations)
+        normalizes = rollout.normalize_observations
+        evaluator = Evaluator(env, params, method, *sizes, normalizes, width=task.evaluation_width)
         return DeviceMachinery(
             Learner(DeviceRollout(env, params, method, rollout), config), evaluator
         )

@@ -296,6 +296,8 @@ class Task:
         `--set=environment.FIELD=value`. None: there is nothing to set.
       host: the environments on the host.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
+      evaluation_width: episodes that evaluations play at a time inside jit; the last of these
+        batches may play more than were asked for, so it is small where steps are dear.
       validation_groups: by split, `universe -> label int[A] of every action`: while training,
         the validation sets of such a split are drawn from half of the groups (spec method 2.2).
         Evaluations after training, and splits that are not named, know no groups.
@@ -329,6 +331,7 @@ class Task:
     stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
     split_seed: int = 0
     selection_metric: str = "is_success"
+    evaluation_width: int = 128
     validation_groups: Mapping[str, Callable[[ActionUniverse], np.ndarray]] = field(
         default_factory=dict
     )

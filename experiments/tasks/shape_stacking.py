@@ -199,6 +199,7 @@ def _task(variant: str, position_dim: int, paper_variant: str) -> Task:
         stage_one=_STAGE_ONE,
         stage_two=_STAGE_TWO,
         selection_metric="final_height",
+        evaluation_width=16,
         # Spec method 2.2: of the Full split alone, and only while training.
         validation_groups={"full": attrgetter("class_labels")},
         measured=Measured(training={"ours": 40.0}, evaluation=4.0),

@@ -12,6 +12,7 @@ import json
 import os
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any, NamedTuple
 from unittest import mock
 
@@ -53,7 +54,6 @@ def watched(job: list[str]) -> Iterator[None]:
     _batches.clear()
     with (
         mock.patch.object(MujocoC, "settle_host", _noting),
-        mock.patch.object(Evaluator.__init__, "__defaults__", _narrow_defaults()),
         mock.patch.object(Evaluator, "_play_sampled", property(_play)),
         mock.patch.object(_training, "machinery_of", _shared),
     ):
@@ -84,15 +84,9 @@ def _noting(engine: MujocoC, shape_ids: Any, qpos: Any, qvel: Any) -> Any:
     return _settle(engine, shape_ids, qpos, qvel)
 
 
-def _narrow_defaults() -> tuple[Any, ...]:
-    """Those of `Evaluator`, whose last is how many episodes are played at a time."""
-    *others, width = Evaluator.__init__.__defaults__ or ()
-    assert width == Evaluator.width
-    return (*others, EPISODES)
-
-
 def _shared(task: Any, method: Any, config: Any, *others: Any) -> Any:
     """`machinery_of`, which gives the same to jobs that differ in numbers only."""
+    task = replace(task, evaluation_width=EPISODES)
     if method.name != "ours":
         return machinery_of(task, method, config, *others)
     key = (task.name, method._is_conditioned, config)
