@@ -27,6 +27,7 @@ from absl import flags
 from experiments import _flags as flag
 from experiments import _paper_figures
 from experiments import _plots as plots
+from experiments._anchors import notes_of
 from experiments._drawing import (
     BAR_SPLITS,
     CURVE_SPLITS,
@@ -153,7 +154,9 @@ def write_table(
     """`results.md` and `results.csv`: every evaluation of every group, beside the paper's."""
     flat = [row for group in groups for row in rows[group.label]]
     contents = {
-        "results.md": as_markdown(environment_of(groups), flat, groups[0].metric, notes),
+        "results.md": as_markdown(
+            environment_of(groups), flat, groups[0].metric, [*notes, *notes_of(groups)]
+        ),
         "results.csv": as_csv(flat),
     }
     for name, text in contents.items():
