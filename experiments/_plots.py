@@ -28,6 +28,7 @@ PAPER_COLOR = "#5b6472"  # Of the paper's numbers, whatever the method.
 
 _TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # Spec method 11.
 _TEST_HATCH = "///"
+_COVER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
 _ANCHOR_DASHES: tuple[Any, ...] = (":", "-.", "--", "-")
 
 
@@ -252,6 +253,7 @@ def _draw_bar(
         textcoords="offset points",
         ha="center",
         va="top" if is_cut else "baseline",
+        bbox=_COVER if is_cut else None,
         fontsize=8.5,
         fontweight="bold" if is_test else "normal",
         color=INK if is_test else FAINT_INK,

@@ -131,11 +131,14 @@ def test_stopping_at_once_on_the_starts_of_evaluations() -> None:
     """Spec 10: the cylinder's s, one of three, and half of it as the reward."""
     found = stacking.play(MujocoC(), 1, np.arange(405), "stop at once", 20, 8)
     env, key = ShapeStacking(MujocoC()), jax.random.key(EVALUATION_SEED)
-    starts = [
-        env.reset_env(jax.random.split(jax.random.fold_in(key, i), 3)[1], env.default_params)[1]
-        for i in range(8)
-    ]
-    sizes = shape_library().s[[int(state.bodies.shape_ids[0]) for state in starts]]
+
+    @jax.jit
+    @jax.vmap
+    def cylinder(number: jax.Array) -> jax.Array:
+        _, key_reset, _ = jax.random.split(jax.random.fold_in(key, number), 3)
+        return env.reset_env(key_reset, env.default_params)[1].bodies.shape_ids[0]
+
+    sizes = shape_library().s[np.asarray(cylinder(jnp.arange(8)))]
     np.testing.assert_allclose(found["final_height"], sizes, atol=0.001)
     assert len(np.unique(sizes)) > 1
     np.testing.assert_allclose(found["reward"], found["final_height"] / 2.0, rtol=1e-6)
