@@ -123,7 +123,7 @@ def bars_figure(
         errors.append("paper, population std over seeds")
     footnote = "Error bars: " + ";\n".join(dict.fromkeys(errors)) + "."
     if any(setting.anchors for setting in settings):
-        footnote += "\nLines: policies without training, on the same kind of sets of test actions."
+        footnote += "\nLines: policies without training, on sets of test actions."
     metric = groups[0].metric
     title = title or f"{environment_of(groups)}: generalization to unseen actions"
     return plots.bars(settings, metric, title, footnote)

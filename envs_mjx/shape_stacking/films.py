@@ -24,11 +24,10 @@ from jaxnew.environment import Action
 # Physics steps between pictures: shown for 60 ms each, they move as fast as the world does.
 FRAME_STEPS = 6
 # A moment is left out where no body has moved further or turned more since the last picture.
-_STILL_M = 0.005
+_STILL_M = 0.01
 _STILL_TURN = 0.02  # Of a quaternion's numbers; half the angle, rad.
 
-# An engine whose every call starts from nothing and asks for no program of its own; cut short, it
-# is exactly the beginning of the whole.
+# An engine that compiles nothing, so that it may be cut short anywhere.
 _EXACT = "mujoco_c"
 
 

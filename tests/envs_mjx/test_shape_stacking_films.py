@@ -102,8 +102,8 @@ def test_what_one_can_see() -> None:
         return Bodies(bodies.shape_ids, qpos, bodies.qvel)
 
     assert not films.has_moved(bodies, bodies)
-    assert not films.has_moved(bodies, moved(1, 0, 0.004))
-    assert films.has_moved(bodies, moved(1, 0, -0.006))
+    assert not films.has_moved(bodies, moved(1, 0, 0.009))
+    assert films.has_moved(bodies, moved(1, 0, -0.011))
     assert films.has_moved(bodies, moved(0, 5, 0.03))
     assert not films.has_moved(bodies, moved(0, 5, 0.01))
     assert not films.has_moved(bodies, moved(5, 2, 9.0))  # Not used.
