@@ -82,7 +82,7 @@ def let_go(state: StackingState, after: StackingState, action: Action) -> Bodies
       action: with f32[k] position, k of 0 to 2.
     """
     slot = scene.NUM_START_CYLINDERS + int(state.num_actions)
-    shape_id = int(after.bodies.shape_ids[slot]) if slot < scene.NUM_SLOTS else -1
+    shape_id = int(after.bodies.shape_ids[slot])
     if shape_id < 0:
         return _on_host(state.bodies)
     xy = np.zeros(2, np.float32)

@@ -16,7 +16,7 @@ from envs_mjx.shape_stacking import ShapeStacking, films
 from envs_mjx.shape_stacking.camera import task_camera
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments import _drawing, _films, _finetuning, _paper_figures
+from experiments import _drawing, _films, _finetuning, _paper_figures, figures
 from experiments._episode import is_success
 from experiments._figure_list import FIGURES, number_of
 from experiments._flags import load_task
@@ -232,7 +232,11 @@ def test_bars_of_figure_23_with_anchors(tmp_path: Path) -> None:
     assert "| stop at once | test | 0.500 [0.400, 0.600] |" in content
     assert "merge the results of several machines" in content
     assert Image.open(picture).size[0] > 1200
-    figure = _drawing.bars_figure(groups, {g.label: result_rows(g) for g in groups}, "t")
+    of_groups = {group.label: result_rows(group) for group in groups}
+    table, _ = figures.write_table(groups, of_groups, tmp_path, ["A note."])
+    assert table.read_text().count("Policies without training, shape_stacking") == 3
+    assert "A note." in table.read_text()
+    figure = _drawing.bars_figure(groups, of_groups, "t")
     (axes,) = figure.axes
     lines = [
         (float(np.mean(line.get_xdata())), float(line.get_ydata()[0]))
