@@ -166,7 +166,7 @@ def episode_animation(
       num_candidates: episodes 0.. that are looked at.
 
     Returns:
-      The two files; none for a task without a drawing of its episodes, which is said.
+      The two files; none for another task than Grid World, which is said.
 
     Raises:
       RunDirectoryError: `run_path` is no run of `train`.

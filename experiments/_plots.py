@@ -214,11 +214,11 @@ def _draw_anchor(axes: Axes, position: int, height: float, dashes: Any) -> None:
 
 def _beyond(settings: Sequence[BarSetting], metric: Metric, end: float) -> str:
     """What the axis does not reach."""
-    found: dict[str, list[str]] = {}
+    found: dict[str, dict[str, None]] = {}
     for setting in settings:
         for name, mean in setting.anchors.items():
             if metric.scale * mean > end:
-                found.setdefault(name, []).append(metric.text(mean))
+                found.setdefault(name, {})[metric.text(mean)] = None
     lines = [f"{name} at {', '.join(values)}{metric.unit}" for name, values in found.items()]
     return f"Lines above the axis: {'; '.join(lines)}." if lines else ""
 

@@ -240,7 +240,8 @@ class Filming:
     Attributes:
       draw: see `DrawEpisode`.
       success_from: an episode whose `Task.selection_metric` is at least this is a success.
-      criterion: the same in words, where the metric is not success itself.
+      criterion: the same in words, where the metric is not success itself. The sheet of an
+        evaluation's last pictures then shows the best and the worst of them.
     """
 
     draw: DrawEpisode

@@ -192,6 +192,7 @@ def test_heights_end_at_the_papers_limit_unless_test_bars_are_higher() -> None:
     settings = [
         BarSetting("a", RED, both, {"train": Bar(2.5, 2.25, 2.8)}, anchors=lines),
         BarSetting("b", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"scripted": 3.5}),
+        BarSetting("b", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"scripted": 4.25}),
         BarSetting("c", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"random": 1.5}),
     ]
     figure = bars(settings, metric, footnote="so")
@@ -211,7 +212,8 @@ def test_heights_end_at_the_papers_limit_unless_test_bars_are_higher() -> None:
         ((-0.46, 0.46), 1.25, ":"),
         ((-0.46, 0.46), 4.25, "-."),
         ((0.54, 1.46), 3.5, "-."),
-        ((1.54, 2.46), 1.5, ":"),
+        ((1.54, 2.46), 4.25, "-."),
+        ((2.54, 3.46), 1.5, ":"),
     ]
     assert legend_texts(figure) == ["unseen test actions", "train actions", "random", "scripted"]
     assert figure.get_supxlabel() == "so\nLines above the axis: scripted at 4.250, 3.500 m."
