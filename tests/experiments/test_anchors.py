@@ -146,6 +146,23 @@ def test_stopping_at_once_on_the_starts_of_evaluations() -> None:
     np.testing.assert_array_equal(found["num_steps"], 1.0)
 
 
+@pytest.mark.integration
+@pytest.mark.parametrize(("name", "position_dim"), [("scripted", 0), ("random, never stops", 2)])
+def test_anchors_of_the_other_ways_of_placing(name: str, position_dim: int) -> None:
+    # Nothing falls far in one physics step, so that every shape is let go above the last one.
+    found = stacking.play(MujocoC(settle_steps=1), position_dim, np.arange(405), name, 20, 16)
+    placed, repeats = found["num_placed"], found["num_repeats"]
+    np.testing.assert_array_equal(found["num_steps"], 10.0)
+    # Of 20 shapes of 405, about 40 % are flat-topped.
+    assert placed.min() < placed.max() <= 10.0
+    assert placed.min() >= 1.0
+    expected = 0.0 if name == "scripted" else 10.0 - placed
+    np.testing.assert_array_equal(repeats, expected)
+    # The more shapes, the higher the last one; and all of them count in the reward's mean.
+    assert np.corrcoef(placed, found["final_height"])[0, 1] > 0.2
+    assert (found["reward"] > 0.5 * found["final_height"]).all()
+
+
 @pytest.mark.golden
 @pytest.mark.slow
 def test_what_the_spec_found() -> None:
