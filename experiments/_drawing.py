@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 
 from experiments import _flags as flag
 from experiments import _plots as plots
+from experiments._anchors import lines_of
 from experiments._artifacts import REPRESENTATION_SEED, Domain
 from experiments._curves import CurveSetting, RunCurve, learning_curves
 from experiments._paper import PaperCurve, paper_curve, paper_method
@@ -113,7 +114,7 @@ def bars_figure(
             _note([row.num_seeds for row in by_split.values()], test.trained_steps),
             _note(paper_seeds, test.paper_steps) if paper else "",
         )
-        settings.append(BarSetting(group.label, color, ours, paper, *notes))
+        settings.append(BarSetting(group.label, color, ours, paper, *notes, lines_of(group)))
         episodes = f" ({test.num_episodes:,} episodes a bar)" if test.num_seeds == 1 else ""
         errors.append(f"ours, {test.error}{episodes}")
     if not settings:
@@ -121,6 +122,8 @@ def bars_figure(
     if any(setting.paper for setting in settings):
         errors.append("paper, population std over seeds")
     footnote = "Error bars: " + ";\n".join(dict.fromkeys(errors)) + "."
+    if any(setting.anchors for setting in settings):
+        footnote += "\nLines: policies without training, on sets of test actions."
     metric = groups[0].metric
     title = title or f"{environment_of(groups)}: generalization to unseen actions"
     return plots.bars(settings, metric, title, footnote)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +13,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
+from jaxnew.environment import Action
 from jaxnew.ppo import TrainState
 from jaxnew.sampling import ActionPool, draw_sets
+from jaxnew.task import Task
 
 DRAWN_TASK = "grid_world"
 
@@ -24,18 +28,25 @@ class Episode:
     Attributes:
       number: i of `Evaluator`, which plays the same episode under the same seed.
       states: T + 1 environment states.
-      action_ids: T ids.
+      actions: T actions.
       rewards: T rewards.
-      is_success: how it ended.
+      metrics: the environment's `episode_metrics`, at the end.
+      is_success: see `Filming`.
       available_ids: int32[m] the actions there were to choose from.
     """
 
     number: int
     states: list[Any]
-    action_ids: list[int]
+    actions: list[Action]
     rewards: list[float]
+    metrics: dict[str, float]
     is_success: bool
     available_ids: np.ndarray
+
+    @property
+    def action_ids(self) -> list[int]:
+        """Of its actions; an action that stops has an id, too."""
+        return [int(action.id) for action in self.actions]
 
 
 def play_episodes(
@@ -80,7 +91,7 @@ def _programs(trainer: Trainer, state: TrainState, seed: int) -> tuple[Any, Any]
         return (keys[:, 2], available, projected), (obs, env_state)
 
     @jax.jit
-    def step(fixed: Any, carry: Any, t: jax.Array) -> tuple[Any, ...]:
+    def step(fixed: Any, carry: Any, t: jax.Array) -> tuple[Any, Any]:
         (keys, available, projected), (obs, env_state) = fixed, carry
         if evaluator.normalize_observations:
             obs = statistics.normalize(obs)
@@ -91,7 +102,8 @@ def _programs(trainer: Trainer, state: TrainState, seed: int) -> tuple[Any, Any]
         obs, env_state, reward, terminated, truncated, info = jax.vmap(
             env.step_env, in_axes=(0, 0, 0, None)
         )(keys_now[:, 1], env_state, action, env_params)
-        return (obs, env_state), action.id, reward, terminated | truncated, info["is_success"]
+        metrics = {name: info[name] for name in env.episode_metrics}
+        return (obs, env_state), (action, reward, terminated | truncated, metrics)
 
     return start, step
 
@@ -105,25 +117,34 @@ def _play_block(
     fixed, carry = start(trainer.pools[split], numbers)
     states, steps = [jax.device_get(carry[1])], []
     for t in range(evaluator.env.max_episode_steps(evaluator.env_params)):
-        carry, *outcome = step(fixed, carry, jnp.int32(t))
+        carry, outcome = step(fixed, carry, jnp.int32(t))
         states.append(jax.device_get(carry[1]))
-        steps.append([np.asarray(values) for values in outcome])
-    ids, rewards, done, is_success = (np.stack(values) for values in zip(*steps, strict=True))
+        steps.append(jax.device_get(outcome))
+    done = np.stack([step_done for _, _, step_done, _ in steps])
     sets = np.asarray(fixed[1].ids)[:, : evaluator.set_size]
     episodes = []
     for row, number in enumerate(np.asarray(numbers)):
         length = 1 + int(np.argmax(done[:, row]))  # The time limit ends every episode.
+        of_row = partial(jax.tree.map, lambda x, i=row: x[i])
+        metrics = {name: float(value) for name, value in of_row(steps[length - 1][3]).items()}
         episodes.append(
             Episode(
                 number=int(number),
-                states=[jax.tree.map(lambda x, i=row: x[i], s) for s in states[: length + 1]],
-                action_ids=[int(i) for i in ids[:length, row]],
-                rewards=[float(r) for r in rewards[:length, row]],
-                is_success=bool(is_success[length - 1, row]),
+                states=[of_row(state) for state in states[: length + 1]],
+                actions=[of_row(action) for action, *_ in steps[:length]],
+                rewards=[float(reward[row]) for _, reward, *_ in steps[:length]],
+                metrics=metrics,
+                is_success=is_success(trainer.task, metrics),
                 available_ids=sets[row],
             )
         )
     return episodes
+
+
+def is_success(task: Task, metrics: Mapping[str, float]) -> bool:
+    """Whether an episode inside jit that ended with these metrics is shown as a success."""
+    least = 1.0 if task.filming is None else task.filming.success_from
+    return metrics[task.selection_metric] >= least
 
 
 def episode_animation(
@@ -145,14 +166,14 @@ def episode_animation(
       num_candidates: episodes 0.. that are looked at.
 
     Returns:
-      The two files; none for a task without a drawing of its episodes, which is said.
+      The two files; none for another task than Grid World, which is said.
 
     Raises:
       RunDirectoryError: `run_path` is no run of `train`.
     """
     run, trainer, _ = load_trainer(run_path)
     if trainer.task.name != DRAWN_TASK:
-        print(f"Episodes of task {trainer.task.name} cannot be drawn, so no animation.")
+        print(f"No animation of {trainer.task.name}: --figure=8 films episodes of other tasks.")
         return []
     state, _ = load_state(run, trainer, "best")
     if episode is None:

@@ -1,30 +1,32 @@
 """Zero-shot episodes of a trained policy as films, successes apart from failures (paper figure 8).
 
-Episodes on the host are those of `evaluate`: a pool that keeps what it was told plays them, and
-each is played again from its seed and its actions, this time to be looked at.
+They are episodes of `evaluate`. On the host they are played twice, see `_host_episodes`; inside jit
+their states are kept and drawn.
 """
 
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
 from experiments import _plots as plots
+from experiments._episode import play_episodes
 from experiments._flags import UsageError
-from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
+from experiments._host_episodes import check_film, play_host_episodes
+from experiments._plots import Metric
+from experiments._training import Trainer, load_state, load_trainer
 from experiments._video import write_video
 from jaxnew.ppo import TrainState
-from jaxnew.rollout.pool import HostEnvironments, HostPool, HostStep
-from jaxnew.task import Film
+from jaxnew.task import Filming, MakeFilm
 
 SUCCESS, FAILURE = "success", "failure"
 _FILE = "episode-{:03d}"
@@ -33,104 +35,43 @@ _GOOD, _BAD = "#1b7f4d", "#b3382c"
 
 
 @dataclass(frozen=True)
-class HostEpisode:
-    """An episode of a pool of host environments.
+class FilmedEpisode:
+    """An episode and its pictures.
 
     Attributes:
-      number: i of `HostEvaluator`.
-      seed: of its reset.
-      ids, positions: int32[T] and f32[T, k], what its environment was told.
-      metrics: of the pool's `episode_metrics`, at its end.
+      number: i of the evaluation.
+      is_success: how it ended.
+      action_ids: what was chosen.
+      metrics: at its end.
+      frames: uint8[height, width, 3] each.
     """
 
     number: int
-    seed: np.random.SeedSequence
-    ids: np.ndarray
-    positions: np.ndarray
+    is_success: bool
+    action_ids: Sequence[int]
     metrics: dict[str, float]
+    frames: Sequence[np.ndarray]
+
+    @property
+    def outcome(self) -> str:
+        """Of its folder."""
+        return SUCCESS if self.is_success else FAILURE
 
 
-class RecordedPool:
-    """A pool that keeps the episodes of an evaluation.
-
-    Args:
-      pool: what plays.
+@dataclass(frozen=True)
+class Still:
+    """What a sheet shows of an episode.
 
     Attributes:
-      episodes: those that are over, by number.
+      number, is_success: of the episode.
+      value: of the task's selection metric, at its end.
+      picture: uint8[height, width, 3] its last one.
     """
 
-    def __init__(self, pool: HostPool) -> None:
-        self._pool = pool
-        self._running: list[list[tuple[int, np.ndarray]]] = [[] for _ in range(pool.num_envs)]
-        self._numbers = np.arange(pool.num_envs)
-        self._seed = 0
-        self.episodes: dict[int, HostEpisode] = {}
-
-    def __getattr__(self, name: str) -> Any:
-        """What the pool has."""
-        return getattr(self._pool, name)
-
-    def reset_numbered(self, seed: int) -> np.ndarray:
-        """See `HostPool`; forgets what was kept."""
-        self._seed, self.episodes = seed, {}
-        self._running = [[] for _ in self._running]
-        self._numbers = np.arange(len(self._running))
-        return self._pool.reset_numbered(seed)
-
-    def send(self, half: int, ids: np.ndarray, positions: np.ndarray) -> None:
-        """See `HostPool`; keeps the actions."""
-        first = half * len(ids)
-        for row, (action_id, position) in enumerate(zip(ids, positions, strict=True)):
-            self._running[first + row].append((int(action_id), np.array(position)))
-        self._pool.send(half, ids, positions)
-
-    def receive(self, half: int) -> HostStep:
-        """See `HostPool`; keeps the episodes that are over."""
-        step = self._pool.receive(half)
-        is_over = np.asarray(step.terminated) | np.asarray(step.truncated)
-        first = half * len(is_over)
-        for row in np.flatnonzero(is_over):
-            metrics = {name: float(values[row]) for name, values in step.metrics.items()}
-            self._keep(first + int(row), metrics)
-        return step
-
-    def _keep(self, env: int, metrics: dict[str, float]) -> None:
-        number = int(self._numbers[env])
-        ids, positions = zip(*self._running[env], strict=True)
-        self.episodes[number] = HostEpisode(
-            number,
-            np.random.SeedSequence(self._seed, spawn_key=(number,)),
-            np.array(ids, np.int32),
-            np.array(positions, np.float32),
-            metrics,
-        )
-        self._running[env] = []
-        self._numbers[env] += len(self._numbers)
-
-
-def play_host_episodes(
-    trainer: Trainer, state: TrainState, split: str, count: int, seed: int = EVALUATION_SEED
-) -> list[HostEpisode]:
-    """Episodes `0..count-1`, sampled, exactly as `evaluate` plays them.
-
-    Args:
-      trainer: of a run on the host.
-      state: whose parameters play.
-      split: part of the split that available sets are drawn from.
-      count: how many.
-      seed: of the evaluation.
-    """
-    evaluator = trainer.evaluator
-    environments = evaluator.environments
-    pool = RecordedPool(environments.pool)
-    recorded = HostEnvironments(
-        lambda: pool, environments.max_episode_steps, environments.stack_size
-    )
-    replace(evaluator, environments=recorded).run(
-        state.params, None, trainer.table, trainer.pools[split], jax.random.key(seed), count
-    )
-    return [pool.episodes[number] for number in range(count)]
+    number: int
+    is_success: bool
+    value: float
+    picture: np.ndarray
 
 
 def film_run(
@@ -148,7 +89,7 @@ def film_run(
     picture; earlier ones are removed. Beside `out`, a sheet of the last pictures and a table.
 
     Args:
-      path: a run of `train` on the host.
+      path: a run of `train` or a member of `sweep`.
       out: folder.
       count: episodes.
       size: pixels of the pictures' height.
@@ -164,38 +105,74 @@ def film_run(
       RuntimeError: an episode went another way when it was played again.
     """
     run, trainer, _ = load_trainer(path, num_workers)
-    host = trainer.task.host
-    if host is None or host.make_film is None:
-        raise UsageError(f"Episodes of task {trainer.task.name} cannot be filmed.")
+    task = trainer.task
     with closing(trainer):
         state, _ = load_state(run, trainer, "best")
-        episodes = play_host_episodes(trainer, state, "test", count)
-    clear(out)
-    rows, stills, films = [], [], []
-    for episode in episodes:
-        film = host.make_film(episode.seed, episode.ids, episode.positions, size=size)
-        outcome = checked_outcome(episode, film, trainer.task.selection_metric)
-        stem = out / outcome / _FILE.format(episode.number)
-        films.append(write_video(film.frames, stem.with_suffix(suffix)))
-        for word, frame in (("start", film.frames[0]), ("end", film.frames[-1])):
-            Image.fromarray(frame).save(stem.with_name(f"{stem.name}-{word}.png"))
-        stills.append((episode.number, outcome, film.frames[-1]))
-        rows.append(
-            {
-                "episode": episode.number,
-                "outcome": outcome,
-                "num_actions": len(episode.ids),
-                **episode.metrics,
-                "action_ids": " ".join(map(str, episode.ids)),
-                "film": films[-1].relative_to(out.parent),
-            }
-        )
+        episodes = filmed(trainer, state, count, size)
+        clear(out)
+        rows, stills, films = [], [], []
+        for episode in episodes:
+            films.append(write_episode(episode, out, suffix))
+            value = episode.metrics[task.selection_metric]
+            stills.append(Still(episode.number, episode.is_success, value, episode.frames[-1]))
+            rows.append(_row(episode, films[-1].relative_to(out.parent)))
     table = out.with_suffix(".csv")
     with table.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-    return [*plots.save(sheet(stills, title), out.with_suffix(".png")), table, *films]
+    if task.filming is not None and task.filming.criterion:
+        metric = Metric.of(task.selection_metric)
+        picture = ranked_sheet(stills, metric, task.filming.criterion, title)
+    else:
+        picture = sheet(stills, title)
+    return [*plots.save(picture, out.with_suffix(".png")), table, *films]
+
+
+def _row(episode: FilmedEpisode, film: Path) -> dict[str, Any]:
+    """An episode in the table."""
+    return {
+        "episode": episode.number,
+        "outcome": episode.outcome,
+        "num_actions": len(episode.action_ids),
+        **episode.metrics,
+        "action_ids": " ".join(map(str, episode.action_ids)),
+        "film": film,
+    }
+
+
+def filmed(trainer: Trainer, state: TrainState, count: int, size: int) -> Iterator[FilmedEpisode]:
+    """The first episodes on sets of test actions; each is drawn when it is asked for.
+
+    Raises:
+      UsageError: the task's episodes cannot be drawn.
+    """
+    host, filming = trainer.task.host, trainer.task.filming
+    if host is not None and host.make_film is not None:
+        return _filmed_on_host(host.make_film, trainer, state, count, size)
+    if filming is not None:
+        return _filmed_inside_jit(filming, trainer, state, count, size)
+    raise UsageError(f"Episodes of task {trainer.task.name} cannot be filmed.")
+
+
+def _filmed_on_host(
+    make_film: MakeFilm, trainer: Trainer, state: TrainState, count: int, size: int
+) -> Iterator[FilmedEpisode]:
+    for episode in play_host_episodes(trainer, state, "test", count):
+        film = make_film(episode.seed, episode.ids, episode.positions, size=size)
+        check_film(episode, film)
+        is_success = episode.metrics[trainer.task.selection_metric] > 0
+        ids = episode.ids.tolist()
+        yield FilmedEpisode(episode.number, is_success, ids, episode.metrics, film.frames)
+
+
+def _filmed_inside_jit(
+    filming: Filming, trainer: Trainer, state: TrainState, count: int, size: int
+) -> Iterator[FilmedEpisode]:
+    env = trainer.evaluator.env
+    for e in play_episodes(trainer, state, "test", 0, count):
+        frames = filming.draw(env, e.states, e.actions, e.rewards, size=size)
+        yield FilmedEpisode(e.number, e.is_success, e.action_ids, e.metrics, frames)
 
 
 def clear(out: Path) -> None:
@@ -206,42 +183,75 @@ def clear(out: Path) -> None:
             file.unlink()
 
 
-def checked_outcome(episode: HostEpisode, film: Film, metric: str) -> str:
-    """`success` or `failure`, of an episode whose film ends as it did.
-
-    Raises:
-      RuntimeError: it does not.
-    """
-    shown = {name: film.metrics[name] for name in episode.metrics}
-    if not np.allclose(
-        list(shown.values()), list(episode.metrics.values()), atol=1e-5, equal_nan=True
-    ):
-        raise RuntimeError(
-            f"Episode {episode.number} ended with {episode.metrics}, and with {shown} when it was "
-            "played again; the environment is not a function of its seed and its actions."
-        )
-    return SUCCESS if episode.metrics[metric] > 0 else FAILURE
+def write_episode(episode: FilmedEpisode, out: Path, suffix: str) -> Path:
+    """An episode's film, and beside it its first and its last picture; returns the film."""
+    stem = out / episode.outcome / _FILE.format(episode.number)
+    for word, frame in (("start", episode.frames[0]), ("end", episode.frames[-1])):
+        Image.fromarray(frame).save(stem.with_name(f"{stem.name}-{word}.png"))
+    return write_video(episode.frames, stem.with_suffix(suffix))
 
 
-def sheet(stills: Sequence[tuple[int, str, np.ndarray]], title: str = "") -> Figure:
-    """The last pictures of episodes, with their numbers and outcomes.
+def sheet(stills: Sequence[Still], title: str = "") -> Figure:
+    """The last pictures of all episodes, with their numbers and outcomes.
 
     Args:
-      stills: (number, outcome, uint8[height, width, 3]) of each.
+      stills: of each.
       title: of the sheet; the share of successes is added.
     """
-    num_rows = -(-len(stills) // _NUM_COLUMNS)
-    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
-    every = figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel()
-    for axes in every[len(stills) :]:
-        axes.set_axis_off()
-    for axes, (number, outcome, picture) in zip(every, stills, strict=False):
-        axes.imshow(picture, interpolation="none")
-        axes.set_xticks([])
-        axes.set_yticks([])
-        axes.spines[:].set_color(plots.GRID_COLOR)
-        color = _GOOD if outcome == SUCCESS else _BAD
-        axes.set_title(f"episode {number}: {outcome}", fontsize=9, color=color)
-    share = f"{sum(outcome == SUCCESS for _, outcome, _ in stills)} of {len(stills)} successful"
-    plots.set_title(figure, f"{title} ({share})" if title else share)
+    figure, every = _grid(len(stills))
+    for axes, still in zip(every, stills, strict=False):
+        _show(axes, still)
+        outcome = SUCCESS if still.is_success else FAILURE
+        axes.set_title(f"episode {still.number}: {outcome}", fontsize=9, color=_color(still))
+    _set_title(figure, title, stills, "successful")
     return figure
+
+
+def ranked_sheet(
+    stills: Sequence[Still], metric: Metric, criterion: str, title: str = ""
+) -> Figure:
+    """The last pictures of the best and of the worst episodes, with their metric below each.
+
+    Args:
+      stills: of all episodes; up to ten of them are shown, from best to worst.
+      metric: of their values.
+      criterion: of success.
+      title: of the sheet; the share of successes is added.
+    """
+    ranked = sorted(stills, key=lambda still: -still.value)
+    if len(ranked) > 2 * _NUM_COLUMNS:
+        ranked = ranked[:_NUM_COLUMNS] + ranked[-_NUM_COLUMNS:]
+    figure, every = _grid(len(ranked))
+    for axes, still in zip(every, ranked, strict=False):
+        _show(axes, still)
+        text = f"{metric.text(still.value)}{metric.unit} (episode {still.number})"
+        axes.set_xlabel(text, fontsize=9, color=_color(still))
+    chosen = "" if len(ranked) == len(stills) else f", best and worst of {len(stills)}"
+    _set_title(figure, f"{title}{chosen}", stills, criterion)
+    return figure
+
+
+def _grid(count: int) -> tuple[Figure, list[Axes]]:
+    """A figure with room for so many pictures."""
+    num_rows = -(-count // _NUM_COLUMNS)
+    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
+    every = list(figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel())
+    for axes in every[count:]:
+        axes.set_axis_off()
+    return figure, every
+
+
+def _show(axes: Axes, still: Still) -> None:
+    axes.imshow(still.picture, interpolation="none")
+    axes.set_xticks([])
+    axes.set_yticks([])
+    axes.spines[:].set_color(plots.GRID_COLOR)
+
+
+def _color(still: Still) -> str:
+    return _GOOD if still.is_success else _BAD
+
+
+def _set_title(figure: Figure, title: str, stills: Sequence[Still], criterion: str) -> None:
+    share = f"{sum(still.is_success for still in stills)} of {len(stills)} {criterion}"
+    plots.set_title(figure, f"{title} ({share})" if title else share)

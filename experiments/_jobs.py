@@ -170,10 +170,10 @@ def sweep_job(
     domain = source.domain
     budget = source.budget_of(cell.method)
     listed = ",".join(map(str, seeds))
-    name = (
-        f"sweep-{file_name(cell.method)}-{cell.representation}-{source.budget}-{budget.num_updates}"
-    )
-    folder = folder or domain.folder(source.folder) / f"{name}-{listed.replace(',', '-')}"
+    words = ["sweep", file_name(cell.method), cell.representation]
+    words += [domain.split_name] * (domain.split_name != domain.task.default_split)
+    words += [source.budget, str(budget.num_updates), listed.replace(",", "-")]
+    folder = folder or domain.folder(source.folder) / "-".join(words)
     command = (
         "sweep",
         *_settings(source, cell),

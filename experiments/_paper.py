@@ -28,11 +28,14 @@ _METHODS = {
     ("ours", "hvae-onehot"): "ours_onehot",
     ("ours", "hvae-state"): "ours",
     ("ours", "hvae-video"): "ours_video",
+    ("ours", "hvae-image"): "ours",
     ("ours", "gt12"): "ours_engineered",
+    ("ours", "gt21"): "ours_engineered",
     ("ours", "gt32"): "ours_engineered",
     ("ours", "vae"): "vae",
     ("ours", "vae-xy"): "vae",
     ("ours", "vae-state"): "vae",
+    ("ours", "vae-image"): "vae",
     ("ours", "product"): "ours",
     ("ours", "product-mu"): "ours",
     ("ours", "hvae-oracle"): "ours_oracle_hvae",
@@ -44,12 +47,13 @@ _BASELINES = {
     "continuous": "continuous_output",
     "nearest-neighbour": "nearest_neighbor",
 }
-_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "hvae-state", "product", "product-mu")
+_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "hvae-state", "hvae-image", "product", "product-mu")
 
 # Where a representation makes the paper's results those of an environment of its own.
 _ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"}
-# Figure of a split that is not the domain's default; its rows have the same names of methods.
-_SPLIT_FIGURES = {"full": "fig7a_create_full_split"}
+# Figure of a split that is not the domain's default, and what it appends to the names of methods.
+_SPLIT_FIGURES = {"full": ("fig7a_create_full_split", "")}
+_SPLIT_FIGURES_OF = {("Shape Stacking", "full"): ("fig23_stacking_variants", "full_split")}
 # Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
 _SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
@@ -118,9 +122,17 @@ def paper_method(method: str, representation: str, variant: str = "") -> str | N
     return name if any(row.method == name for row in _results()) else None
 
 
-def paper_figure_of_split(split: str) -> str | None:
-    """The figure that has the rows of a split which is not the default; None if there is none."""
-    return _SPLIT_FIGURES.get(split)
+def paper_figure_of_split(environment: str | None, split: str) -> tuple[str, str] | None:
+    """Where the paper reports on a split which is not the default; None if it does not.
+
+    Args:
+      environment: the paper's name of the domain, or None.
+      split: ours, such as `full`.
+
+    Returns:
+      The figure, and what it appends to the names of methods.
+    """
+    return _SPLIT_FIGURES_OF.get((str(environment), split), _SPLIT_FIGURES.get(split))
 
 
 def paper_environment(environment: str | None, representation: str) -> str | None:

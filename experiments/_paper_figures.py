@@ -11,6 +11,7 @@ from absl import flags
 
 from experiments import _flags as flag
 from experiments import _plots as plots
+from experiments._anchors import notes_of
 from experiments._artifacts import TABLE_FILE, Domain, find_table
 from experiments._comparison import compare_curves, comparison_csv, comparison_markdown
 from experiments._drawing import (
@@ -225,7 +226,8 @@ def draw(
     rows = {g.label: [r for r in result_rows(g) if r.is_standard] for g in groups}
     drawn = bars_figure(groups, rows, title)
     files = plots.save(drawn, out / f"{name}.png", values.pdf) if drawn else []
-    notes = [figure.note] if figure.note else []
+    note = figure.notes.get(first.domain.task.name, figure.note)
+    notes = [*([note] if note else []), *notes_of(groups)]
     return files + write_results(name, title, groups, rows, out, notes)
 
 

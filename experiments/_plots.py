@@ -8,7 +8,7 @@ from __future__ import annotations
 import colorsys
 import textwrap
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
 Color = tuple[float, float, float]
@@ -27,6 +28,8 @@ PAPER_COLOR = "#5b6472"  # Of the paper's numbers, whatever the method.
 
 _TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # Spec method 11.
 _TEST_HATCH = "///"
+_COVER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
+_ANCHOR_DASHES: tuple[Any, ...] = (":", "-.", "--", "-")
 
 
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK}
@@ -41,12 +44,15 @@ class Metric:
       scale: what values are multiplied by.
       limit: upper end of the axis in scaled units, None for what the numbers need.
       unit: after a number.
+      cuts_train: bars of train actions end at `limit` if they are higher; those of test actions
+        make the axis longer.
     """
 
     name: str
     scale: float = 1.0
     limit: float | None = None
     unit: str = ""
+    cuts_train: bool = False
 
     @classmethod
     def of(cls, name: str, paper_name: str | None = None) -> Metric:
@@ -55,8 +61,8 @@ class Metric:
             return cls("Success rate (%)", 100.0, 110.0, "%")
         if paper_name == "ctr":
             return cls("Click-through rate", limit=0.5)
-        if paper_name == "final_height":
-            return cls("Final height", limit=2.75)
+        if "final_height" in (paper_name, name):
+            return cls("Final height (m)", limit=2.75, unit=" m", cuts_train=True)
         readable = name.removeprefix("is_").removeprefix("has_").replace("_", " ").capitalize()
         is_share = name.startswith(("is_", "has_"))
         return cls(f"{readable} (%)", 100.0, 110.0, "%") if is_share else cls(readable)
@@ -91,6 +97,7 @@ class BarSetting:
       color: of our bars.
       ours, paper: by split, `train` and `test`; either may be absent.
       ours_note, paper_note: below the bars, such as `5 seeds`.
+      anchors: what policies without training reach on test actions, by name: lines across.
     """
 
     label: str
@@ -99,6 +106,7 @@ class BarSetting:
     paper: Mapping[str, Bar]
     ours_note: str = ""
     paper_note: str = ""
+    anchors: Mapping[str, float] = field(default_factory=dict)
 
 
 def hls_palette(n: int, l: float = 0.6, s: float = 0.9, h: float = 0.7) -> list[Color]:  # noqa: E741
@@ -121,7 +129,8 @@ def bars(
     axes = figure.subplots()
     ticks: list[tuple[float, str]] = []
     num_lines = 1 + max(max(s.ours_note.count("\n"), s.paper_note.count("\n")) for s in settings)
-    highest = 0.0
+    end = _axis_end(settings, metric)
+    dashes = _anchor_dashes(settings)
     for position, setting in enumerate(settings):
         sides: list[tuple[str, Mapping[str, Bar], Color | str, str]] = [
             ("ours", setting.ours, setting.color, setting.ours_note)
@@ -133,9 +142,9 @@ def bars(
             ticks.append((x, f"{name}\n{note}" if note else name))
             for split in ("train", "test"):
                 if split in by_split:
-                    bar = by_split[split]
-                    _draw_bar(axes, x, bar, split, color, metric)
-                    highest = max(highest, metric.scale * max(bar.mean, bar.high))
+                    _draw_bar(axes, x, by_split[split], split, color, metric, end)
+        for name, mean in setting.anchors.items():
+            _draw_anchor(axes, position, metric.scale * mean, dashes[name])
         axes.annotate(
             textwrap.fill(setting.label, 26),
             (position, 0.0),
@@ -150,14 +159,14 @@ def bars(
         )
     axes.set_xticks([x for x, _ in ticks], [text for _, text in ticks], fontsize=8.5)
     axes.set_xlim(-0.55, len(settings) - 0.45)
-    axes.set_ylim(0.0, metric.limit if (metric.limit or 0.0) >= highest else 1.12 * highest)
+    axes.set_ylim(0.0, end)
     if metric.limit == 110.0:
         axes.set_yticks(range(0, 101, 20))
     axes.set_ylabel(metric.name, fontsize=9, color=INK)
     tidy(axes)
     axes.tick_params(axis="x", length=0)
     axes.grid(visible=False, axis="x")
-    handles = [
+    handles: list[Any] = [
         Patch(facecolor=PAPER_COLOR, alpha=_TEST_ALPHA, edgecolor="black", hatch=_TEST_HATCH),
         Patch(facecolor=PAPER_COLOR, alpha=_TRAIN_ALPHA),
     ]
@@ -167,16 +176,57 @@ def bars(
         "bbox_to_anchor": (0.5, 1.0),
         "borderaxespad": 0.2,
     }
-    axes.legend(handles, labels, ncols=2, **above, **LEGEND)
+    handles += [Line2D([], [], color=INK, linewidth=1.1, linestyle=d) for d in dashes.values()]
+    labels += list(dashes)
+    num_columns = max(2, min(len(labels), int(0.9 * figure.get_figwidth() / _legend_entry(labels))))
+    axes.legend(handles, labels, ncols=num_columns, **above, **LEGEND)
+    footnote = "\n".join(line for line in (footnote, _beyond(settings, metric, end)) if line)
     if footnote:
         figure.supxlabel(footnote, fontsize=7.5, color=FAINT_INK)
     set_title(figure, title)
     return figure
 
 
+def _axis_end(settings: Sequence[BarSetting], metric: Metric) -> float:
+    """Upper end of the axis: the metric's limit, or what the bars need."""
+    bars = [
+        bar
+        for setting in settings
+        for by_split in (setting.ours, setting.paper)
+        for split, bar in by_split.items()
+        if split == "test" or not metric.cuts_train
+    ]
+    highest = metric.scale * max((max(bar.mean, bar.high) for bar in bars), default=0.0)
+    return metric.limit if metric.limit is not None and metric.limit >= highest else 1.12 * highest
+
+
+def _anchor_dashes(settings: Sequence[BarSetting]) -> dict[str, Any]:
+    """A style of lines for each anchor of any setting."""
+    names = list(dict.fromkeys(name for setting in settings for name in setting.anchors))
+    return {name: _ANCHOR_DASHES[i % len(_ANCHOR_DASHES)] for i, name in enumerate(names)}
+
+
+def _draw_anchor(axes: Axes, position: int, height: float, dashes: Any) -> None:
+    """A line across one setting."""
+    ends = [position - 0.46, position + 0.46]
+    axes.plot(ends, [height] * 2, color=INK, linewidth=1.1, linestyle=dashes, zorder=3.5)
+
+
+def _beyond(settings: Sequence[BarSetting], metric: Metric, end: float) -> str:
+    """What the axis does not reach."""
+    found: dict[str, dict[str, None]] = {}
+    for setting in settings:
+        for name, mean in setting.anchors.items():
+            if metric.scale * mean > end:
+                found.setdefault(name, {})[metric.text(mean)] = None
+    lines = [f"{name} at {', '.join(values)}{metric.unit}" for name, values in found.items()]
+    return f"Lines above the axis: {'; '.join(lines)}." if lines else ""
+
+
 def _draw_bar(
-    axes: Axes, x: float, bar: Bar, split: str, color: Color | str, metric: Metric
+    axes: Axes, x: float, bar: Bar, split: str, color: Color | str, metric: Metric, end: float
 ) -> None:
+    """A bar with its error and its number; `end` is that of the axis."""
     is_test = split == "test"
     height = metric.scale * bar.mean
     errors = [[metric.scale * (bar.mean - bar.low)], [metric.scale * (bar.high - bar.mean)]]
@@ -195,12 +245,15 @@ def _draw_bar(
     # Beside each other, so that both are seen where the bars are of like height.
     shifted = x + (0.085 if is_test else -0.085)
     axes.errorbar(shifted, height, yerr=errors, color=INK, capsize=2.5, linewidth=1.1, zorder=4)
+    is_cut = metric.scale * bar.high > end
     axes.annotate(
-        metric.text(bar.mean),
-        (shifted, metric.scale * bar.high),
-        xytext=(0, 2.5),
+        metric.text(bar.mean) + " ↑" * (height > end),
+        (shifted, end if is_cut else metric.scale * bar.high),
+        xytext=(0, -2.5 if is_cut else 2.5),
         textcoords="offset points",
         ha="center",
+        va="top" if is_cut else "baseline",
+        bbox=_COVER if is_cut else None,
         fontsize=8.5,
         fontweight="bold" if is_test else "normal",
         color=INK if is_test else FAINT_INK,

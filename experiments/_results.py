@@ -177,7 +177,8 @@ def as_markdown(title: str, rows: Sequence[ResultRow], metric: Metric, notes: Se
         "standard deviation over seeds, as in the paper, whose numbers are 5,000 sampled episodes "
         "per seed. Seeds and steps: ours / the paper's; episodes are per seed. Steps are those "
         "that a run was trained for; the checkpoint is the best one by validation."
-        " Difference: ours minus the paper's" + (", in percentage points." if metric.unit else "."),
+        " Difference: ours minus the paper's"
+        + (", in percentage points." if metric.unit == "%" else "."),
     ]
     lines += [f"\n{note}" for note in notes]
     return "\n".join(lines) + "\n"
@@ -194,7 +195,7 @@ def _cells(row: ResultRow, metric: Metric) -> list[str]:
         steps = "-"
     if row.paper_mean is not None and row.paper_std is not None and row.paper_steps is not None:
         paper = f"{metric.text(row.paper_mean)} ± {metric.text(row.paper_std)}"
-        difference = f"{row.difference:+.1f}" if metric.unit else f"{row.difference:+.3f}"
+        difference = f"{row.difference:+.1f}" if metric.unit == "%" else f"{row.difference:+.3f}"
         seeds += f" / {row.paper_num_seeds}"
         steps += f" / {1e-6 * row.paper_steps:.3g}"
     ours = f"{metric.text(row.mean)} {error}"

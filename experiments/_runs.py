@@ -131,11 +131,13 @@ class Group:
     @property
     def paper_method(self) -> str | None:
         """What the paper calls this setting; None where it has no counterpart."""
-        is_shown = self.is_default_split or self.paper_figure is not None
+        is_shown = self.is_default_split or self._paper_split is not None
         if self.paper_environment is None or not is_shown or self.is_ours_alone:
             return None
         conditioned = "conditioned_auxiliary" if self.config.get("conditions_position") else ""
-        variant = "_".join(word for word in (self.task.paper_variant, conditioned) if word)
+        of_split = self._paper_split[1] if self._paper_split else ""
+        words = (self.task.paper_variant, conditioned, of_split)
+        variant = "_".join(word for word in words if word)
         return paper_method(self.config["method"], self.representation, variant)
 
     @property
@@ -151,7 +153,14 @@ class Group:
     @property
     def paper_figure(self) -> str | None:
         """Where the rows of `paper_method` stand; None for the first figure that has them."""
-        return None if self.is_default_split else paper_figure_of_split(self.config["split"])
+        return self._paper_split[0] if self._paper_split else None
+
+    @property
+    def _paper_split(self) -> tuple[str, str] | None:
+        """See `paper_figure_of_split`; None for the default split."""
+        if self.is_default_split:
+            return None
+        return paper_figure_of_split(self.paper_environment, self.config["split"])
 
     @property
     def is_finetuned(self) -> bool:

@@ -1,104 +1,101 @@
-"""What policies that know the Recommender reach: anchors for the results (spec recommender 6).
+"""What policies without training reach: anchors for the results.
 
     python -m experiments.anchors --sets=train,test --set_sizes=50,500
+    python -m experiments.anchors --task=shape_stacking --sets=train,validation,test --episodes=500
 
-`random` chooses uniformly; `dot` takes the product with the largest `beta . omega`, the best that
-a policy can do whose table hides `mu`; `oracle` that with the largest `beta . omega + mu`.
+Of the Recommender, those that know products and tastes; of Shape Stacking (and of
+`shape_stacking-no-place` and `shape_stacking-2d-place`), stopping, random play and a script. The
+anchors of Shape Stacking are kept beside its runs, where `figures` finds them.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from absl import flags
 
-from envs_mjx.recommender import Recommender, RecommenderParams, RecommenderState
 from experiments import _flags as flag
+from experiments._anchors import FOLDER, Anchors, Summary, table_header, table_row
 from experiments._artifacts import Domain
-from jaxnew.environment import Action, Transition
-from jaxnew.evaluation import Evaluator, summarize
-from jaxnew.policy import Categorical
-from jaxnew.policy.utility import RandomMethod
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool
+from experiments._training import EVALUATION_SEED
 
-SETS = flags.DEFINE_list("sets", ["train", "test"], "Parts of the split.")
-SET_SIZES = flags.DEFINE_list("set_sizes", ["50", "500"], "Products in a set.")
-EPISODES = flags.DEFINE_integer("episodes", 5000, "Episodes of each anchor.")
-_SEED = 2020
-
-WEIGHTS = {"random": (0.0, 0.0), "dot": (1.0, 0.0), "oracle": (1.0, 1.0)}  # beta . omega, mu.
+_STACKING = "shape_stacking"
 
 
-class OpenRecommender(Recommender):
-    """The Recommender with the taste itself as observation, f32[16]."""
-
-    def reset_env(
-        self, key: jax.Array, params: RecommenderParams
-    ) -> tuple[jax.Array, RecommenderState]:
-        _, state = super().reset_env(key, params)
-        return state.omega, state
-
-    def step_env(
-        self, key: jax.Array, state: RecommenderState, action: Action, params: RecommenderParams
-    ) -> Transition:
-        _, state, *rest = super().step_env(key, state, action, params)
-        return (state.omega, state, *rest)  # type: ignore[return-value]
-
-
-class AnchorMethod(RandomMethod):
-    """Scores `weights . (beta . omega, mu)` from rows that hold beta and mu, f32[..., 17]."""
-
-    name = "anchor"
-
-    def __init__(self, weights: tuple[float, float]) -> None:
-        super().__init__()
-        self._weights = weights
-
-    def project(self, params: Any, representations: jax.Array) -> jax.Array:
-        """The rows themselves."""
-        del params
-        return representations
-
-    def distribution(
-        self, params: Any, obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> Categorical:
-        """Logits f32[..., m]; all equal for weights of zero."""
-        del params
-        known, hidden = self._weights
-        taste = jnp.einsum("...md,...d->...m", projected[..., :-1], obs)
-        return Categorical.masked(known * taste + hidden * projected[..., -1], mask)
-
-
-def rates(ids: np.ndarray, table: jax.Array, name: str, set_size: int, episodes: int) -> Any:
-    """Episode metrics of one anchor with intervals, on sets drawn from `ids`."""
-    env = OpenRecommender()
-    method = AnchorMethod(WEIGHTS[name])
-    evaluator = Evaluator(env, env.default_params, method, set_size, normalize_observations=False)
-    pool = ActionPool.of(ids, capacity=len(table))
-    statistics = RunningStatistics.zeros((table.shape[1] - 1,))
-    is_greedy = name != "random"
-    key = jax.random.key(_SEED)
-    return summarize(evaluator.run({}, statistics, table, pool, key, episodes, is_greedy))
+def define_flags() -> None:
+    """Flags of the command; not at import, since other commands have flags of these names."""
+    flags.DEFINE_list("sets", ["train", "test"], "Parts of the split.")
+    flags.DEFINE_list("set_sizes", [], "Actions in a set; default: 50,500, or as in training.")
+    flags.DEFINE_integer("episodes", 0, "Episodes of each anchor; 0: 5000, or 500 of stacking.")
+    flags.DEFINE_string("physics", "auto", "Engine that stacks; see engines.make_engine.")
+    flags.DEFINE_string("out", None, "Folder of the file; default: anchors/ beside the runs.")
+    flags.set_default(flag.TASK, "recommender")
 
 
 def main() -> None:
-    domain = Domain.of(flag.load_task("recommender"), flag.SPLIT.value)
-    table = jnp.asarray(domain.universe.engineered["product-mu"])
-    print("| products | set size | policy | click-through rate [95 % interval] | episode length |")
-    print("|" + " --- |" * 5)
-    for part in SETS.value:
-        for size in map(int, SET_SIZES.value):
-            for name in WEIGHTS:
-                found = rates(domain.split.ids(part), table, name, size, EPISODES.value)
-                rate, length = found["click_through_rate"], found["episode_length"]
-                interval = f"[{rate['low']:.3f}, {rate['high']:.3f}]"
-                cells = [part, str(size), name, f"{rate['mean']:.3f} {interval}"]
-                print("| " + " | ".join([*cells, f"{length['mean']:.1f}"]) + " |", flush=True)
+    values = flags.FLAGS
+    task = flag.load_task(flag.TASK.value)
+    sizes = [int(size) for size in values.set_sizes]
+    if task.name == "recommender":
+        domain = Domain.of(task, flag.SPLIT.value)
+        recommend(domain, values.sets, sizes, values.episodes)
+    elif task.actions_name == _STACKING:
+        domain = Domain.of(task, flag.SPLIT.value)
+        default = Path(flag.RUNS.value) / task.name / FOLDER
+        out = Path(values.out) if values.out else default
+        print(stack(domain, values.physics, values.sets, sizes, values.episodes, out))
+    else:
+        raise flag.UsageError(
+            f"Task {task.name} has no anchors; there are those of recommender and {_STACKING}."
+        )
+
+
+def recommend(domain: Domain, parts: list[str], sizes: list[int], episodes: int) -> None:
+    """Prints the anchors of the Recommender."""
+    from experiments import _recommender_anchors as recommender
+
+    sizes, episodes = sizes or list(recommender.SET_SIZES), episodes or recommender.EPISODES
+    for line in recommender.lines(domain, parts, sizes, episodes):
+        print(line, flush=True)
+
+
+def stack(
+    domain: Domain, physics: str, parts: list[str], sizes: list[int], episodes: int, out: Path
+) -> Path:
+    """Prints the anchors of a variant of Shape Stacking and keeps them.
+
+    Args:
+      physics: see `engines.make_engine`.
+      parts: of the split.
+      sizes: none for sets as in training, or one.
+      episodes: of each; 0 for the default.
+      out: folder of the file, which is written anew after every line.
+
+    Returns:
+      The file.
+
+    Raises:
+      UsageError: several sizes.
+    """
+    from envs_mjx.shape_stacking.engines import make_engine
+    from experiments import _stacking_anchors as stacking
+
+    if len(sizes) > 1:
+        raise flag.UsageError(f"A file of anchors has sets of one size; got {sizes}.")
+    engine = make_engine(physics)
+    size = sizes[0] if sizes else domain.task.stage_two["paper"].ppo.rollout.set_size
+    episodes = episodes or stacking.EPISODES
+    print("\n".join(table_header(stacking.METRICS)), flush=True)
+    found: dict[str, dict[str, Summary]] = {}
+    path = out
+    for policy, part, summary in stacking.summaries(domain, engine, parts, size, episodes):
+        print(table_row(policy, part, summary), flush=True)
+        found.setdefault(policy, {})[part] = summary
+        names = domain.task.name, domain.split_name, engine.name
+        path = Anchors(*names, size, episodes, EVALUATION_SEED, found).save(out)
+    return path
 
 
 if __name__ == "__main__":
+    define_flags()
     flag.run_command(main)

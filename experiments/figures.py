@@ -3,6 +3,7 @@
     python -m experiments.figures --run=RUN,RUN,RUN --out=DIRECTORY
     python -m experiments.figures --figure=4,6,24 --task=grid_world --budget=paper
     python -m experiments.figures --figure=8 --task=create-push --run=RUN
+    python -m experiments.figures --figure=8 --task=shape_stacking --run=RUN --film_size=400
 
 With `--run`, whatever the directories hold is drawn; nothing is trained or evaluated. Runs that
 differ in their seed only are drawn as one setting; a sweep stands for its members, and a run of
@@ -13,7 +14,8 @@ are missing are made, after a list of them with the time that they take (`--dry_
 only); stopped and called again, it goes on where it was. Runs of domains inside jit are made by
 `sweep`, all seeds in one program, those of domains on the host by `train`, one after the other.
 
-Figure 8 are films of zero-shot episodes, of a run that is given or else of the first seed's.
+Figure 8 are films of zero-shot episodes, of a run that is given or else of the first seed's. Bars
+have lines for policies without training where `experiments.anchors` has measured them.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ from absl import flags
 from experiments import _flags as flag
 from experiments import _paper_figures
 from experiments import _plots as plots
+from experiments._anchors import notes_of
 from experiments._drawing import (
     BAR_SPLITS,
     CURVE_SPLITS,
@@ -153,7 +156,9 @@ def write_table(
     """`results.md` and `results.csv`: every evaluation of every group, beside the paper's."""
     flat = [row for group in groups for row in rows[group.label]]
     contents = {
-        "results.md": as_markdown(environment_of(groups), flat, groups[0].metric, notes),
+        "results.md": as_markdown(
+            environment_of(groups), flat, groups[0].metric, [*notes, *notes_of(groups)]
+        ),
         "results.csv": as_csv(flat),
     }
     for name, text in contents.items():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple, Protocol
@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxnew.actions import ActionSplit, ActionUniverse
-from jaxnew.environment import ActionSpec, Environment, ObservationSpec
+from jaxnew.environment import Action, ActionSpec, Environment, ObservationSpec
 from jaxnew.observations import RecordBlock, RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
@@ -208,6 +208,47 @@ class MakeFilm(Protocol):
     ) -> Film: ...
 
 
+class DrawEpisode(Protocol):
+    """Draws an episode of an environment inside jit.
+
+    Args:
+      env: where it was played.
+      states: T + 1 states, the start and what `step_env` returned after each action.
+      actions: T actions.
+      rewards: T rewards.
+      size: pixels of the frames' height, about.
+
+    Returns:
+      Frames uint8[height, width, 3], all of one size; the last one shows the end.
+    """
+
+    def __call__(
+        self,
+        env: Any,
+        states: Sequence[Any],
+        actions: Sequence[Action],
+        rewards: Sequence[float],
+        *,
+        size: int,
+    ) -> list[np.ndarray]: ...
+
+
+@dataclass(frozen=True)
+class Filming:
+    """How episodes of an environment inside jit are shown.
+
+    Attributes:
+      draw: see `DrawEpisode`.
+      success_from: an episode whose `Task.selection_metric` is at least this is a success.
+      criterion: the same in words, where the metric is not success itself. The sheet of an
+        evaluation's last pictures then shows the best and the worst of them.
+    """
+
+    draw: DrawEpisode
+    success_from: float = 1.0
+    criterion: str = ""
+
+
 @dataclass(frozen=True)
 class HostDomain:
     """Environments that run on the host, in a pool.
@@ -309,6 +350,8 @@ class Task:
       representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
         representation should explain; for the report.
       studies: what `analyze` offers for this task beside what it offers for every one.
+      filming: how episodes are shown where the environment runs inside jit, or None where they
+        cannot be drawn; on the host see `HostDomain.make_film`.
       actions_name: folder of recordings and encoders, for tasks that share their actions and play;
         also a name that `--task` takes for one of them. None for a task with its own.
       place: `package.module:NAME` that the task was loaded from, or None for one of
@@ -341,6 +384,7 @@ class Task:
     paper_variant: str = ""
     representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
     studies: Mapping[str, ActionStudy] = field(default_factory=dict)
+    filming: Filming | None = None
     actions_name: str | None = None
     place: str | None = None
 

@@ -122,6 +122,7 @@ def render_rgb(
     *,
     has_table: bool,
     has_shadows: bool,
+    size: int = FRAME_SIZE,
 ) -> jax.Array:
     """A picture of shapes before a black background. Pure; all arrays may be traced and vmapped.
 
@@ -133,10 +134,16 @@ def render_rgb(
       camera: where from.
       has_table: whether the table's top is drawn.
       has_shadows: whether the two spots cast shadows.
+      size: pixels of a side.
 
     Returns:
-      uint8[84, 84, 3] RGB, row 0 on top.
+      uint8[size, size, 3] RGB, row 0 on top.
+
+    Raises:
+      ValueError: there is no pixel.
     """
+    if size < 1:
+        raise ValueError(f"size={size} must be 1 or more.")
     library = shape_library()
     ids = jnp.asarray(shape_ids, jnp.int32)
     chex.assert_rank(ids, 1)
@@ -148,7 +155,7 @@ def render_rgb(
         position=jnp.asarray(positions, jnp.float32),
         rotation=_rotation(jnp.asarray(quaternions, jnp.float32)),
     )
-    directions = _directions(camera)
+    directions = _directions(camera, size)
     origin = (camera.position[0], camera.position[1], camera.position[2])
     hits = nearest(bodies, origin, directions, _table_distance(origin, directions, has_table))
     points = walk(origin, jnp.where(jnp.isfinite(hits.distance), hits.distance, 0.0), directions)
@@ -157,7 +164,7 @@ def render_rgb(
     color = jnp.where(hits.surface[:, None] < 0, _TABLE_COLOR, colors[hits.body])
     light = jnp.where(jnp.isfinite(hits.distance), light, 0.0)
     picture = jnp.clip(color * light[:, None], 0.0, 1.0)
-    return jnp.round(255.0 * picture).astype(jnp.uint8).reshape(FRAME_SIZE, FRAME_SIZE, 3)
+    return jnp.round(255.0 * picture).astype(jnp.uint8).reshape(size, size, 3)
 
 
 def _light(
@@ -187,11 +194,11 @@ def _towards(spot: tuple[float, float, float], points: Vector) -> tuple[Vector, 
     return (x / distance, y / distance, z / distance), distance
 
 
-def _directions(camera: Camera) -> Vector:
-    """f32[84 * 84] each: unit vectors through the middles of the pixels, row by row."""
-    focal = FRAME_SIZE / 2.0 / math.tan(_FIELD_OF_VIEW / 2.0)
-    steps = (np.arange(FRAME_SIZE, dtype=np.float32) - (FRAME_SIZE - 1) / 2.0) / focal
-    rows, columns = np.repeat(steps, FRAME_SIZE), np.tile(steps, FRAME_SIZE)
+def _directions(camera: Camera, size: int) -> Vector:
+    """f32[size * size] each: unit vectors through the middles of the pixels, row by row."""
+    focal = size / 2.0 / math.tan(_FIELD_OF_VIEW / 2.0)
+    steps = (np.arange(size, dtype=np.float32) - (size - 1) / 2.0) / focal
+    rows, columns = np.repeat(steps, size), np.tile(steps, size)
     lengths = np.sqrt(1.0 + rows**2 + columns**2)
     x, y, z = (
         (camera.forward[axis] + columns * camera.right[axis] + rows * camera.down[axis]) / lengths

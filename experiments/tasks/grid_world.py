@@ -2,23 +2,46 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import jax
 import numpy as np
 
-from envs_mjx.grid_world import GridWorld, play, skill_universe, skills
+from envs_mjx.grid_world import GridWorld, drawing, play, skill_universe, skills
 from jaxnew.actions import ActionUniverse, random_halves_split
+from jaxnew.environment import Action
 from jaxnew.observations import RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.learner import Modality, RepresentationConfig
 from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import Baselines, LoopConfig, Measured, Play, StageOneBudget, StageTwoBudget, Task
+from jaxnew.task import (
+    Baselines,
+    Filming,
+    LoopConfig,
+    Measured,
+    Play,
+    StageOneBudget,
+    StageTwoBudget,
+    Task,
+)
 
 
 def _record_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
     return np.asarray(play.record(jax.random.key(seed), ids, num_recordings))
+
+
+def _draw_episode(
+    env: GridWorld,
+    states: Sequence[Any],
+    actions: Sequence[Action],
+    rewards: Sequence[float],
+    *,
+    size: int,
+) -> list[np.ndarray]:
+    del env
+    return drawing.draw_episode(states, [int(action.id) for action in actions], rewards, size)
 
 
 def _targets(universe: ActionUniverse) -> Mapping[str, np.ndarray]:
@@ -137,4 +160,5 @@ TASK = Task(
     ),
     paper_environment="Grid World",
     representation_targets=_targets,
+    filming=Filming(_draw_episode),
 )

@@ -12,6 +12,7 @@ from operator import attrgetter
 from typing import Literal
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
+from envs_mjx.shape_stacking.films import draw_episode
 from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.observations import RecordingFormat
@@ -21,6 +22,7 @@ from jaxnew.representation.modality import image_modality
 from jaxnew.rollout.device import RolloutConfig
 from jaxnew.task import (
     Drawing,
+    Filming,
     LoopConfig,
     Measured,
     Play,
@@ -182,6 +184,14 @@ _PLAY = Play(
     folder="viewpoints",
 )
 
+# No height is a success by itself. 1.3 m is what random play reaches on average that never stops
+# (`experiments.anchors`): a policy that has learned something builds higher.
+_FILMING = Filming(
+    draw_episode,
+    success_from=1.3,
+    criterion="at least 1.3 m, the mean of random play that never stops",
+)
+
 
 def _published(name: str, universe: ActionUniverse, seed: int) -> ActionSplit:
     del universe, seed  # It cannot be drawn anew (spec 9).
@@ -203,6 +213,7 @@ def _task(variant: str, position_dim: int, paper_variant: str) -> Task:
         # Spec method 2.2: of the Full split alone, and only while training.
         validation_groups={"full": attrgetter("class_labels")},
         measured=Measured(training={"ours": 40.0}, evaluation=4.0),
+        filming=_FILMING,
         paper_environment="Shape Stacking",
         paper_variant=paper_variant,
         actions_name="shape_stacking",

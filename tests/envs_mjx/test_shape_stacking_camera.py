@@ -33,7 +33,7 @@ CYLINDER, S = 799, LIBRARY.s[799]
 Scene = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 gray = jax.jit(render, static_argnames="has_shadows")
-rgb = jax.jit(render_rgb, static_argnames=("has_table", "has_shadows"))
+rgb = jax.jit(render_rgb, static_argnames=("has_table", "has_shadows", "size"))
 
 
 def scene(*shapes: tuple[int, tuple[float, float, float]]) -> Scene:
@@ -84,6 +84,20 @@ def test_reference_frame(has_shadows: bool) -> None:
     table = (picture > 0) & ~covered
     np.testing.assert_allclose(extent(table)[:2], (70, 83), atol=1)
     assert picture[table].mean() == pytest.approx(0.216, rel=0.04)
+
+
+def test_a_larger_picture_has_the_pixels_of_the_small_one() -> None:
+    """The middle of every three times three pixels is the middle of one of the usual size."""
+    arguments = (*crowd(3, 0.5), task_camera())
+    small = np.asarray(rgb(*arguments, has_table=True, has_shadows=False)).astype(int)
+    large = np.asarray(rgb(*arguments, has_table=True, has_shadows=False, size=252))
+    assert large.shape == (252, 252, 3)
+    middles = large[1::3, 1::3].astype(int)
+    # Rounding sends a ray past an edge, and light to the next of 256 levels.
+    assert (np.abs(middles - small) > 1).any(axis=-1).mean() < 1e-3
+    assert small.any()
+    with pytest.raises(ValueError, match="size=0 must be 1 or more"):
+        render_rgb(*arguments, has_table=True, has_shadows=False, size=0)
 
 
 def test_the_original_casts_shadows() -> None:

@@ -54,27 +54,31 @@ def write_run(
     config: dict[str, Any],
     curve: tuple[float, ...] = (0.1, 0.3, 0.2),
     table: RepresentationTable | None = None,
+    metric: str = "is_success",
+    updates: int = 2,
 ) -> Path:
-    """A run of two updates per evaluation; validation is half of train."""
+    """A run with an evaluation after so many updates; validation is half of train."""
     with RunDirectory.open_or_create(path, config):
         table = table or engineered_table(skill_universe(), "gt12")
         table.save(path / TABLE_FILE)
         a_split().save(path / SPLIT_FILE)
         with MetricsLog(path) as log:
             for number, value in enumerate(curve):
-                step = 2 * (number + 1)
+                step = updates * (number + 1)
                 log.write(step, {"loss/total": 1.0})
-                log.write(step, {"train/is_success": value, "validation/is_success": value / 2})
+                log.write(step, {f"train/{metric}": value, f"validation/{metric}": value / 2})
     return path
 
 
-def write_evaluation(path: Path, actions: str, mean: float, **changes: Any) -> None:
+def write_evaluation(
+    path: Path, actions: str, mean: float, metric: str = "is_success", **changes: Any
+) -> None:
     content = {
         "checkpoint": "best",
         "step": 4,
         "actions": actions,
         "metrics": {
-            "is_success": {"mean": mean, "low": mean - 0.02, "high": mean + 0.01, "interval": ""}
+            metric: {"mean": mean, "low": mean - 0.02, "high": mean + 0.01, "interval": ""}
         },
         "num_episodes": 1000,
         "set_size": 50,

@@ -176,11 +176,49 @@ def test_bars_draw_the_numbers() -> None:
 @pytest.mark.unit
 def test_a_metric_has_the_unit_and_limit_of_the_paper() -> None:
     assert Metric.of("is_success").text(0.7029) == "70.3"
-    assert Metric.of("final_height", "final_height") == Metric("Final height", limit=2.75)
+    height = Metric("Final height (m)", limit=2.75, unit=" m", cuts_train=True)
+    assert Metric.of("final_height", "final_height") == Metric.of("final_height") == height
     assert Metric.of("click_through_rate", "ctr").text(0.1968) == "0.197"
     assert Metric.of("has_reached_subgoal").name == "Reached subgoal (%)"
     high = bars([BarSetting("a", RED, {"test": Bar(7.5, 7.0, 8.0)}, {})], Metric.of("x", "ctr"))
     assert high.axes[0].get_ylim()[1] > 8.0  # A limit never hides a bar.
+
+
+@pytest.mark.unit
+def test_heights_end_at_the_papers_limit_unless_test_bars_are_higher() -> None:
+    metric = Metric.of("final_height")
+    both = {"train": Bar(7.5, 6.4, 8.7), "test": Bar(1.4, 1.3, 1.5)}
+    lines = {"random": 1.25, "scripted": 4.25}
+    settings = [
+        BarSetting("a", RED, both, {"train": Bar(2.5, 2.25, 2.8)}, anchors=lines),
+        BarSetting("b", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"scripted": 3.5}),
+        BarSetting("b", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"scripted": 4.25}),
+        BarSetting("c", RED, {"test": Bar(1.0, 0.9, 1.1)}, {}, anchors={"random": 1.5}),
+    ]
+    figure = bars(settings, metric, footnote="so")
+    (axes,) = figure.axes
+    assert axes.get_ylim() == (0.0, 2.75)
+    numbers = {t.get_text(): t for t in axes.texts}
+    # Cut off, with its number below the end; one whose error bar alone is, without an arrow.
+    assert numbers["7.500 ↑"].xy[1] == numbers["2.500"].xy[1] == 2.75
+    assert {numbers[text].get_va() for text in ("7.500 ↑", "2.500")} == {"top"}
+    assert (numbers["1.400"].xy[1], numbers["1.400"].get_va()) == (1.5, "baseline")
+    drawn = [
+        (tuple(line.get_xdata()), line.get_ydata()[0], line.get_linestyle())
+        for line in axes.lines
+        if len(line.get_xdata()) == 2
+    ]
+    assert drawn == [
+        ((-0.46, 0.46), 1.25, ":"),
+        ((-0.46, 0.46), 4.25, "-."),
+        ((0.54, 1.46), 3.5, "-."),
+        ((1.54, 2.46), 4.25, "-."),
+        ((2.54, 3.46), 1.5, ":"),
+    ]
+    assert legend_texts(figure) == ["unseen test actions", "train actions", "random", "scripted"]
+    assert figure.get_supxlabel() == "so\nLines above the axis: scripted at 4.250, 3.500 m."
+    higher = bars([BarSetting("a", RED, {"test": Bar(3.0, 2.9, 3.0)}, {})], metric)
+    assert higher.axes[0].get_ylim()[1] == pytest.approx(1.12 * 3.0)
 
 
 @pytest.mark.unit
@@ -563,6 +601,7 @@ def test_episodes_are_those_of_the_evaluation(trainer: Trainer, untrained: Train
     assert [sum(e.rewards) for e in played] == pytest.approx(
         expected["episode_return"][20:].tolist(), abs=1e-5
     )
+    assert [e.metrics["episode_return"] for e in played] == expected["episode_return"][20:].tolist()
     moves = [int(e.states[-1].num_moves) for e in played]
     assert moves == expected["episode_length"][20:].astype(int).tolist()
     test_ids = set(a_split().test.tolist())
@@ -575,7 +614,7 @@ def test_episodes_are_those_of_the_evaluation(trainer: Trainer, untrained: Train
 @pytest.mark.unit
 def test_the_first_success_is_chosen_and_said() -> None:
     played = [
-        Episode(number, [], [], [], is_success, np.zeros(0, np.int32))
+        Episode(number, [], [], [], {}, is_success, np.zeros(0, np.int32))
         for number, is_success in enumerate([False, False, True, True])
     ]
     assert choose(played) == (

@@ -26,12 +26,14 @@ from envs_host.create.illustration import RenderOptions
 from experiments import _films, _jobs, _paper_figures
 from experiments._artifacts import Domain
 from experiments._figure_list import FIGURES, PaperFigure
-from experiments._films import HostEpisode, checked_outcome, film_run, play_host_episodes
+from experiments._films import Still, film_run
 from experiments._flags import UsageError, load_task
+from experiments._host_episodes import HostEpisode, check_film, play_host_episodes
+from experiments._plots import Metric
 from experiments._production import Cell, Source, find
 from experiments._runs import read_runs
 from experiments._searches import GRIDS, chosen, search_parts
-from experiments._training import TrainConfig, Trainer, save_inputs
+from experiments._training import EVALUATION_SEED, TrainConfig, Trainer, save_inputs
 from jaxnew import config as config_lib
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.metrics import MetricsLog
@@ -97,7 +99,7 @@ def test_films_are_sorted_by_the_outcome_that_they_show(toy: Any, tmp_path: Path
     assert [file.name for file in files[:2]] == ["figure_8.png", "figure_8.csv"]
     assert not old.exists()
     state, _ = _films.load_state(RunDirectory.load(path), trainer, "best")
-    key = jax.random.key(_films.EVALUATION_SEED)
+    key = jax.random.key(EVALUATION_SEED)
     expected = trainer.evaluator.run(
         state.params, None, trainer.table, trainer.pools["test"], key, 40
     )
@@ -121,24 +123,50 @@ def test_films_are_sorted_by_the_outcome_that_they_show(toy: Any, tmp_path: Path
         assert not (tmp_path / "figure_8" / other / film.name).exists()
 
 
+@pytest.mark.integration
+def test_episodes_inside_jit_are_drawn_from_their_states(tmp_path: Path) -> None:
+    path, trainer = untrained(tmp_path / "run", "grid_world", "gt12")
+    film_run(path, tmp_path / "out", 12, size=90, title="Grid")
+    state, _ = _films.load_state(RunDirectory.load(path), trainer, "best")
+    arguments = state.params, state.rollout.observation_statistics, trainer.table
+    key = jax.random.key(EVALUATION_SEED)
+    expected = trainer.evaluator.run(*arguments, trainer.pools["test"], key, 12)
+    with (tmp_path / "out.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    for name in ("is_success", "episode_return", "episode_length"):
+        assert [float(row[name]) for row in rows] == expected[name].tolist()
+    for row, is_success, moves in zip(
+        rows, expected["is_success"], expected["episode_length"], strict=True
+    ):
+        outcome = "success" if is_success else "failure"
+        assert row["outcome"] == outcome
+        assert row["film"] == f"out/{outcome}/episode-{int(row['episode']):03d}.gif"
+        film = Image.open(tmp_path / row["film"])
+        # A frame for every move, and the start; the format joins frames that are the same.
+        assert 0.5 * moves < film.n_frames <= 1 + moves
+        end = np.asarray(
+            Image.open((tmp_path / row["film"]).with_name(Path(row["film"]).stem + "-end.png"))
+        )
+        assert end.shape[1:] == (90, 3)
+
+
 @pytest.mark.unit
 def test_a_film_that_ends_otherwise_is_no_film_of_the_episode() -> None:
     played = HostEpisode(
         3, np.random.SeedSequence(0), np.zeros(1), np.zeros((1, 2)), {"is_success": 1.0, "r": 0.5}
     )
     film = Film([], {"is_success": 1.0, "r": 0.5, "more": 7.0})
-    assert checked_outcome(played, film, "is_success") == "success"
+    check_film(played, film)
     lost = replace(played, metrics={"is_success": 0.0, "r": 0.5})
     with pytest.raises(RuntimeError, match=r"Episode 3 ended with .* when it was played again"):
-        checked_outcome(lost, film, "is_success")
-    shown = Film([], {"is_success": 0.0, "r": 0.5})
-    assert checked_outcome(lost, shown, "is_success") == "failure"
+        check_film(lost, film)
+    check_film(lost, Film([], {"is_success": 0.0, "r": 0.5}))
 
 
 @pytest.mark.unit
 def test_a_sheet_names_every_episode() -> None:
     stills = [
-        (number, "success" if number == 1 else "failure", np.full((8, 8, 3), 20 * number, np.uint8))
+        Still(number, number == 1, 0.0, np.full((8, 8, 3), 20 * number, np.uint8))
         for number in range(7)
     ]
     figure = _films.sheet(stills, "Figure 8")
@@ -148,6 +176,30 @@ def test_a_sheet_names_every_episode() -> None:
     assert shown[6] == ("episode 6: failure", 120)
     assert len(figure.axes) == 10
     assert not figure.axes[9].images
+
+
+@pytest.mark.unit
+def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
+    values = [0.5, 3.25, 1.0, 2.0, 0.25, 1.5, 2.5, 0.75, 3.0, 1.25, 1.75, 2.25]
+    stills = [
+        Still(number, value >= 1.5, value, np.full((8, 8, 3), 20 * number, np.uint8))
+        for number, value in enumerate(values)
+    ]
+    figure = _films.ranked_sheet(stills, Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    title = "Figure 8, best and worst of 12 (7 of 12 at least 1.5 m)"
+    assert figure.get_suptitle() == title
+    shown = [(a.get_xlabel(), int(a.images[0].get_array()[0, 0, 0]) // 20) for a in figure.axes]
+    best = [1, 8, 6, 11, 3]
+    worst = [9, 2, 7, 0, 4]
+    assert [number for _, number in shown] == best + worst
+    assert shown[0][0] == "3.250 m (episode 1)"
+    assert shown[9][0] == "0.250 m (episode 4)"
+    colors = [axes.xaxis.label.get_color() for axes in figure.axes]
+    assert len(set(colors[:5])) == len(set(colors[5:])) == 1
+    assert colors[0] != colors[5]
+    few = _films.ranked_sheet(stills[:3], Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    assert few.get_suptitle() == "Figure 8 (1 of 3 at least 1.5 m)"
+    assert [axes.get_xlabel()[:5] for axes in few.axes[:3]] == ["3.250", "1.000", "0.500"]
 
 
 @pytest.mark.integration
@@ -197,8 +249,9 @@ def test_which_run_is_filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     values.run = [str(path)]
     with flagged(task="create-seesaw"), pytest.raises(UsageError, match="of task create-seesaw"):
         _paper_figures.film_given(values)
-    with pytest.raises(UsageError, match="Episodes of task grid_world cannot be filmed"):
-        film_run(untrained(tmp_path / "grid", "grid_world", "gt12")[0], tmp_path / "out", 1)
+    with pytest.raises(UsageError, match="Episodes of task recommender cannot be filmed"):
+        film_run(untrained(tmp_path / "shop", "recommender", "product")[0], tmp_path / "out", 1)
+    assert not (tmp_path / "out").exists()
 
 
 @contextmanager
