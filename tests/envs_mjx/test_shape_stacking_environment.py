@@ -133,6 +133,15 @@ def test_ten_actions_are_the_limit() -> None:
     assert info["final_height"] == pytest.approx(z.max() + 0.5, rel=1e-6)
 
 
+def test_a_stop_at_the_limit_is_a_stop() -> None:
+    params = STILL.default_params.replace(max_actions=jnp.int32(1))
+    action = Action(jnp.int32(690), jnp.zeros(1), jnp.bool_(True))
+    _, _, _, terminated, truncated, _ = jitted_step(STILL)(
+        jax.random.key(0), started(STILL), action, params
+    )
+    assert (bool(terminated), bool(truncated)) == (True, False)
+
+
 def test_reward_of_the_paper_s_text() -> None:
     env = ShapeStacking(Recorder(), reward_variant="paper")
     state, *_ = act(env, started(env), 690, 0.0)
