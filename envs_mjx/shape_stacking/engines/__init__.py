@@ -5,7 +5,7 @@ Each engine is a module of its own, imported by its name, since simulators take 
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,9 @@ import numpy as np
 
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 
-__all__ = ["Engine", "Settled", "check_state"]
+__all__ = ["PHYSICS", "Engine", "Settled", "check_state", "make_engine"]
+
+PHYSICS = ("auto", "mjx", "mujoco")
 
 
 class Settled(NamedTuple):
@@ -79,3 +81,30 @@ def check_state(
             f"shape_ids, qpos and qvel are {shape_ids.dtype}, {qpos.dtype}, {qvel.dtype}; "
             "give int32, float32 and float32."
         )
+
+
+def make_engine(physics: str = "auto", **options: Any) -> Engine:
+    """An engine by its name.
+
+    Args:
+      physics: `mjx`: in the program, for accelerators. `mujoco`: MuJoCo's C engine, on the host's
+        cores. `auto`: `mjx` where jax has an accelerator, else `mujoco`, which is many times
+        faster on a CPU.
+      options: arguments of `mjx.Mjx` or `mujoco_c.MujocoC`; both have `settle_steps`.
+
+    Raises:
+      ValueError: there is no such engine.
+      TypeError: it has no such option.
+      ImportError: as `mjx.Mjx`.
+    """
+    if physics not in PHYSICS:
+        raise ValueError(f"physics={physics!r} is unknown; choose from {PHYSICS}.")
+    if physics == "auto":
+        physics = "mujoco" if jax.default_backend() == "cpu" else "mjx"
+    if physics == "mjx":
+        from envs_mjx.shape_stacking.engines.mjx import Mjx
+
+        return Mjx(**options)
+    from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+
+    return MujocoC(**options)

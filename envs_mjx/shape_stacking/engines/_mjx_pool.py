@@ -15,13 +15,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene, shape_library
+from envs_mjx.shape_stacking.engines._hull_contacts import APART, Hull, four_corners, hull_hull
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
 # Half-length of the capsule that stands for a sphere, m.
 _POINT = 1e-4
-# Distance of contacts that are none, m.
-_APART = 1.0
 
 
 @dataclass(frozen=True)
@@ -49,6 +48,8 @@ class Pool(NamedTuple):
       face_normals: f32[n, F, 3].
       edges: int32[n, E, 2].
       edge_normals: f32[n, E, 2, 3].
+      edge_directions: f32[n, E, 3] along (second x first normal).
+      edge_points: f32[n, E, 3] one end of each edge.
     """
 
     is_hull: jax.Array
@@ -61,6 +62,8 @@ class Pool(NamedTuple):
     face_normals: jax.Array
     edges: jax.Array
     edge_normals: jax.Array
+    edge_directions: jax.Array
+    edge_points: jax.Array
 
 
 @lru_cache(maxsize=1)
@@ -81,8 +84,15 @@ def _constants() -> dict[str, np.ndarray]:
         "face_normals": hulls.face_normals,
         "edges": hulls.edges,
         "edge_normals": hulls.edge_normals,
+        "edge_directions": _edge_directions(hulls.edge_normals),
+        "edge_points": np.take_along_axis(hulls.vertices, hulls.edges[:, :, :1], axis=1),
     }
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in values.items()}
+
+
+def _edge_directions(edge_normals: np.ndarray) -> np.ndarray:
+    vectors = np.cross(edge_normals[:, :, 1], edge_normals[:, :, 0])
+    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def pool(shape_ids: jax.Array) -> Pool:
@@ -102,6 +112,8 @@ def pool(shape_ids: jax.Array) -> Pool:
         face_normals=table["face_normals"][label],
         edges=table["edges"][label],
         edge_normals=table["edge_normals"][label],
+        edge_directions=table["edge_directions"][label],
+        edge_points=s[:, None, None] * table["edge_points"][label],
     )
 
 
@@ -160,9 +172,7 @@ def _pairs(num_slots: int) -> tuple[np.ndarray, np.ndarray]:
     return np.triu_indices(num_slots, 1)
 
 
-def _nearest(
-    is_candidate: jax.Array, gaps: jax.Array, limit: int
-) -> tuple[jax.Array, jax.Array]:
+def _nearest(is_candidate: jax.Array, gaps: jax.Array, limit: int) -> tuple[jax.Array, jax.Array]:
     """The pairs of one kind that overlap the deepest: indices int32[k], and which are any."""
     score = jnp.where(is_candidate, -gaps, -jnp.inf)
     overlap, chosen = jax.lax.top_k(score, min(limit, len(gaps)))
@@ -182,7 +192,7 @@ def _contacts(
 def _table_contacts(points: jax.Array, depth: jax.Array, is_one: jax.Array) -> Contacts:
     """The table's with points f32[n, k, 3] of the bodies, at depths f32[n, k] below its surface."""
     up = jnp.array([0.0, 0.0, 1.0])
-    distance = jnp.where(is_one, -depth, _APART)
+    distance = jnp.where(is_one, -depth, APART)
     position = points + 0.5 * depth[..., None] * up
     second = jnp.arange(1, 1 + len(points))
     normal = jnp.broadcast_to(up, points.shape)
@@ -190,17 +200,14 @@ def _table_contacts(points: jax.Array, depth: jax.Array, is_one: jax.Array) -> C
 
 
 def _table_hulls(pool: Pool, corners: jax.Array) -> Contacts:
-    """Up to four corners of each hull, among those that are within 1 mm of the lowest."""
-    depths = scene.TABLE_HEIGHT - corners[..., 2]
-    lowest = depths.max(axis=1, keepdims=True)
-    down = jnp.array([0.0, 0.0, -1.0])
-    mask = depths > jnp.maximum(0.0, lowest - 1e-3)
-    chosen = jax.vmap(private().manifold_points, (0, 0, None))(corners, mask, down)
-    # The same corner may be chosen several times.
-    is_first = jnp.tril(chosen[:, :, None] == chosen[:, None]).sum(axis=-1) == 1
-    depth = jnp.take_along_axis(depths, chosen, axis=1)
+    """Up to four corners of each hull, the lowest among them."""
+    gaps = corners[..., 2] - scene.TABLE_HEIGHT
+    is_one = (gaps < 0.0) & pool.is_hull[:, None]
+    up, along = jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
+    choose = jax.vmap(four_corners, (0, 0, 0, None, None))
+    chosen, are_new = choose(corners, gaps, is_one, up, along)
     points = jnp.take_along_axis(corners, chosen[..., None], axis=1)
-    return _table_contacts(points, depth, is_first & pool.is_hull[:, None])
+    return _table_contacts(points, -jnp.take_along_axis(gaps, chosen, axis=1), are_new)
 
 
 def _table_rounds(pool: Pool, centers: jax.Array, lengths: jax.Array) -> Contacts:
@@ -220,10 +227,11 @@ def _hull_pairs(
     i, j = _pairs(len(centers))
     chosen, is_near = _nearest(pool.is_hull[i] & pool.is_hull[j], gaps, limit)
     first, second = jnp.asarray(i)[chosen], jnp.asarray(j)[chosen]
-    distance, position, normal = jax.vmap(private().convex_convex)(
-        _hull(pool, first, centers, axes), _hull(pool, second, centers, axes)
-    )
-    distance = jnp.where(is_near[:, None], distance, _APART)
+    turned = _turned(pool, centers, axes)
+    one, two = (jax.tree.map(lambda x, which=which: x[which], turned) for which in (first, second))
+    distance, position, normal = jax.vmap(hull_hull)(one, two)
+    normal = jnp.broadcast_to(normal[:, None], position.shape)
+    distance = jnp.where(is_near[:, None], distance, APART)
     return _contacts(distance, position, normal, first + 1, second + 1)
 
 
@@ -242,7 +250,7 @@ def _mixed_pairs(
         capsule, _hull(pool, second, centers, axes)
     )
     is_twin = pool.is_sphere[first][:, None] & jnp.array([False, True])
-    distance = jnp.where(is_near[:, None] & ~is_twin, distance, _APART)
+    distance = jnp.where(is_near[:, None] & ~is_twin, distance, APART)
     return _contacts(distance, position, normal, first + 1, second + 1)
 
 
@@ -261,9 +269,27 @@ def _round_pairs(
     normal = (other - one) / jnp.maximum(apart, 1e-9)[:, None]
     distance = apart - pool.radius[first] - pool.radius[second]
     position = one + normal * (pool.radius[first] + 0.5 * distance)[:, None]
-    distance = jnp.where(is_near, distance, _APART)
-    return _contacts(
-        distance[:, None], position[:, None], normal[:, None], first + 1, second + 1
+    distance = jnp.where(is_near, distance, APART)
+    return _contacts(distance[:, None], position[:, None], normal[:, None], first + 1, second + 1)
+
+
+def _turned(pool: Pool, centers: jax.Array, axes: jax.Array) -> Hull:
+    """All hulls, with a leading axis."""
+
+    def turn(vectors: jax.Array) -> jax.Array:
+        return jnp.einsum("nij,nkj->nik", axes, vectors)
+
+    return Hull(
+        center=centers,
+        vertices=turn(pool.vertices),
+        normals=turn(pool.face_normals),
+        offsets=(pool.face_normals * pool.face_vertices[:, :, 0]).sum(axis=-1),
+        corners=pool.face_vertices,
+        axes=axes,
+        directions=turn(pool.edge_directions),
+        points=turn(pool.edge_points),
+        firsts=turn(pool.edge_normals[:, :, 0]),
+        seconds=turn(pool.edge_normals[:, :, 1]),
     )
 
 

@@ -27,9 +27,7 @@ WRITTEN_FOR = "3.17"
 _SOURCE = "mujoco.mjx._src"
 # Functions with the names of their arguments, and classes with those of their fields.
 FUNCTIONS = {
-    "collision_convex._convex_convex": ("c1", "c2"),
     "collision_convex._capsule_convex": ("cap", "convex"),
-    "collision_convex._manifold_points": ("poly", "poly_mask", "poly_norm"),
     "math.closest_segment_to_segment_points": ("a0", "a1", "b0", "b1"),
     "math.make_frame": ("a",),
 }
