@@ -159,7 +159,8 @@ def _faces(
     def ours(own: jax.Array, other: jax.Array) -> jax.Array:
         return jnp.where(is_first, own, other)
 
-    center, shift = ours(one.center, two.center), ours(1.0, -1.0) * (two.center - one.center)
+    center = ours(one.center, two.center)
+    shift = ours(two.center, one.center) - center
     normal = ours(one.normals[:, index], two.normals[:, index])
     offset = ours(one.offsets[index], two.offsets[index])
     face = ours(_face(one, index), _face(two, index))

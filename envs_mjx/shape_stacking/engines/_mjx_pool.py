@@ -37,7 +37,7 @@ class Limits:
 
 
 class Pool(NamedTuple):
-    """The shapes of n slots, in metres and in the axes of their bodies, about their centres of mass.
+    """The shapes of n slots, in the axes of their bodies, about their centres of mass, metres.
 
     Attributes:
       is_hull, is_round: bool[n] neither for unused slots.
