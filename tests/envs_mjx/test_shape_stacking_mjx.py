@@ -302,5 +302,5 @@ def test_engines_by_name(monkeypatch: pytest.MonkeyPatch) -> None:
     assert make_engine().name == "mujoco_c"  # Tests run on a CPU.
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     assert make_engine("auto", num_slots=2).name == "mjx"
-    with pytest.raises(ValueError, match="physics='bullet' is unknown; choose from .'auto'"):
+    with pytest.raises(ValueError, match=r"physics='bullet' is unknown; choose from \('auto'"):
         make_engine("bullet")

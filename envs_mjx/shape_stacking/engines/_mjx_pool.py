@@ -19,9 +19,6 @@ from envs_mjx.shape_stacking.engines._hull_contacts import APART, Hull, four_cor
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
-# Half-length of the capsule that stands for a sphere, m.
-_POINT = 1e-4
-
 
 @dataclass(frozen=True)
 class Limits:
@@ -106,7 +103,7 @@ def pool(shape_ids: jax.Array) -> Pool:
         is_round=is_used & ~has_hull,
         is_sphere=is_sphere,
         radius=s,
-        half_length=jnp.where(is_sphere, _POINT, s),
+        half_length=jnp.where(is_sphere, 0.0, s),
         vertices=s[:, None, None] * table["vertices"][label],
         face_vertices=s[:, None, None, None] * table["face_vertices"][label],
         face_normals=table["face_normals"][label],
