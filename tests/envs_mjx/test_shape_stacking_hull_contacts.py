@@ -148,6 +148,69 @@ def test_a_cube_on_a_cube_touches_at_its_corners() -> None:
     np.testing.assert_allclose(np.abs(xy), 1.0, atol=1e-5)
 
 
+def polygon(shape_id: int, x: float, yaw: float) -> np.ndarray:
+    """f64[n, 2] outline of an upright shape from above, counter-clockwise."""
+    axes = Rotation.from_euler("z", yaw).as_matrix()
+    points = corners(shape_id, np.array([x, 0.0, 0.0]), axes)[:, :2]
+    return points[ConvexHull(points).vertices]
+
+
+def shared(one: np.ndarray, two: np.ndarray) -> np.ndarray:
+    """f64[n, 2] what is inside both polygons (Sutherland and Hodgman)."""
+    for start, end in zip(two, np.roll(two, -1, axis=0), strict=True):
+        along = end - start
+        inside = along[0] * (one[:, 1] - start[1]) - along[1] * (one[:, 0] - start[0])
+        kept = []
+        for k in range(len(one)):
+            here, there = inside[k - 1], inside[k]
+            if (here < 0.0) != (there < 0.0):
+                kept.append(one[k - 1] + here / (here - there) * (one[k] - one[k - 1]))
+            if there >= 0.0:
+                kept.append(one[k])
+        one = np.array(kept).reshape(-1, 2)
+        if len(one) == 0:
+            break
+    return one
+
+
+def area(points: np.ndarray) -> float:
+    return float(ConvexHull(points).volume) if len(points) > 2 else 0.0
+
+
+@pytest.mark.oracle
+def test_flat_shapes_touch_within_the_area_that_they_share() -> None:
+    """Boxes and cylinders on each other, turned and shifted: four points span most of it."""
+    rng = np.random.default_rng(4)
+    flat = [690, 684, 799, 594, 624]
+    s = shape_library().s
+    rows = []
+    for _ in range(40):
+        one, two = rng.choice(flat, 2)
+        rows.append((one, two, rng.uniform(0.0, 2.0 * s[one]), rng.uniform(0.0, 2.0 * np.pi)))
+    heights = shape_library().top[flat]
+    half = dict(zip(flat, heights, strict=True))
+    singles = [flat_pair(i, j, half[i] + half[j] - 0.002, yaw, x) for i, j, x, yaw in rows]
+    pairs = Pairs(
+        *(
+            [np.concatenate([single[k][side] for single in singles]) for side in range(2)]
+            for k in range(3)
+        )
+    )
+    contacts = found(pairs)
+    num_areas = 0
+    for k, (one, two, x, yaw) in enumerate(rows):
+        both = shared(polygon(one, 0.0, 0.0), polygon(two, x, yaw))
+        touching = contacts.position[k][contacts.distance[k] < 0.0]
+        if area(both) < 0.01:
+            continue
+        num_areas += 1
+        np.testing.assert_allclose(touching[:, 2], half[one] - 0.001, atol=1e-5)
+        planes = ConvexHull(both).equations
+        assert (touching[:, :2] @ planes[:, :2].T + planes[:, 2]).max() < 1e-4
+        assert area(touching[:, :2]) > 0.5 * area(both)
+    assert num_areas > 20
+
+
 @pytest.mark.unit
 def test_a_plate_that_overhangs_touches_where_it_is_supported() -> None:
     """Cube 690 half over the edge of another: the shared strip, x from s to 2 s of the second."""

@@ -15,6 +15,7 @@ import mujoco
 import numpy as np
 import pytest
 from mujoco import mjx as mujoco_mjx
+from scipy import stats
 
 from envs_mjx.shape_stacking import rules, scene
 from envs_mjx.shape_stacking.engines import (
@@ -25,6 +26,7 @@ from envs_mjx.shape_stacking.engines import (
 from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from experiments import _stacking as stacking
+from experiments import stacking_figures as figures
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 NUM_SLOTS, WIDTH = 5, 24
@@ -91,8 +93,7 @@ def assert_near(found: Any, expected: Any, atol: float) -> None:
         np.testing.assert_allclose(np.asarray(one), np.asarray(other), atol=atol)
 
 
-@pytest.mark.golden
-def test_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
+def assert_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
     """Checks 3, 4 and 6 to 15.
 
     The spec's figures of three checks are of hulls on hulls in one point, where towers creep
@@ -104,8 +105,9 @@ def test_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
     asserted = [(r, c) for r, c in zip(rows, in_c, strict=True) if r.tolerance is not None]
     assert len(asserted) > 70
     assert {row.check for row, _ in asserted} == {3, 4, *range(6, 16)}
+    allowed = {3: 2e-4, 12: 0.03}
     wrong = [
-        (r, c) for r, c in asserted if not abs(r.value - c.value) <= max(0.01, r.tolerance or 0)
+        (r, c) for r, c in asserted if not abs(r.value - c.value) <= allowed.get(r.check, 0.01)
     ]
     assert wrong == []
     creeping = {7, 13, 15}
@@ -117,6 +119,32 @@ def test_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
     assert wrong == []
     fallen = next(row for row in rows if row.spec == "falls off")
     assert fallen.value < 0.5
+
+
+@pytest.mark.golden
+def test_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
+    assert_figures_of_the_spec(engine, c_engine)
+
+
+@pytest.mark.golden
+@pytest.mark.slow
+def test_figures_and_random_play_in_all_slots(c_engine: MujocoC) -> None:
+    """Check 17 with 24 episodes of ten drops, whose heights are those of C as far as that shows.
+
+    With 24 heights each, distributions whose cumulative shares differ by 0.47 would be told apart;
+    for a mean that is off, see the standard error.
+    """
+    engine = OneProgram(Mjx(), WIDTH)
+    assert_figures_of_the_spec(engine, c_engine)
+    never_stop = figures.random_play(0.0)
+    ours, theirs = (figures.play(one, never_stop, WIDTH, 0)[0] for one in (engine, c_engine))
+    difference = ours - theirs
+    error = difference.std(ddof=1) / np.sqrt(WIDTH)
+    print(f"MJX {ours.mean():.3f}, C {theirs.mean():.3f}, {difference.mean():+.3f} +- {error:.3f}")
+    assert 1.0 < ours.mean() < 1.7
+    assert ours.min() > 0.32
+    assert abs(difference.mean()) < 2.5 * error
+    assert stats.ks_2samp(ours, theirs).pvalue > 0.01
 
 
 @pytest.mark.golden
@@ -143,11 +171,9 @@ def test_22_worlds_do_not_depend_on_the_others(engine: OneProgram) -> None:
     whole = engine.settle(ids, qpos, qvel)
     assert whole.ok.all()
     assert np.abs(whole.qpos - qpos).max() > 0.1
-    order = np.random.default_rng(2).permutation(6)
-    shuffled = engine.settle(ids[order], qpos[order], qvel[order])
-    assert_near([x[:, :, 2] for x in shuffled[:1]], [whole.qpos[order, :, 2]], 1e-4)
-    alone = engine.settle(ids[:1], qpos[:1], qvel[:1])
-    assert_near([alone.qpos[:, :, 2]], [whole.qpos[:1, :, 2]], 1e-4)
+    order = [4, 2, 5]  # In other rows, and most other worlds are empty.
+    fewer = engine.settle(ids[order], qpos[order], qvel[order])
+    assert_near([fewer.qpos[:, :, 2]], [whole.qpos[order, :, 2]], 1e-4)
 
 
 @pytest.mark.contract
@@ -175,12 +201,7 @@ def test_what_no_world_can_be_is_given_back(engine: OneProgram) -> None:
     np.testing.assert_array_equal(found.qvel[bad], qvel[bad])
     good = [0, 8, 9, 10, 11]
     assert_near([found.qpos[good]], [expected.qpos[good]], 1e-4)
-
-
-@pytest.mark.contract
-def test_one_program_has_served_all_worlds(engine: OneProgram) -> None:
-    ids, qpos, qvel = dropped(4, 2)
-    engine.settle(ids, qpos, qvel)
+    # All these worlds went through one program.
     assert engine.engine._jitted._cache_size() == 1
 
 
