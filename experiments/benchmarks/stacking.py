@@ -82,9 +82,10 @@ def bare_loop(shape_ids: np.ndarray, num_steps: int) -> Callable[[Any, Any], Non
 Inputs = Callable[[jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
 
 
-def placements(num_worlds: int, num_steps: int) -> Inputs:
+def placements(num_worlds: int) -> Inputs:
     """Worlds at all stages of an episode in which a shape has just been let go, by key."""
-    bodies, slots, ids = towers(MujocoC(num_steps), min(num_worlds, _TOWERS))
+    before = MujocoC(5 if m.QUICK.value else scene.SETTLE_STEPS)
+    bodies, slots, ids = towers(before, min(num_worlds, _TOWERS))
     repeated = np.arange(num_worlds) % len(ids)
     bodies = jax.tree.map(lambda x: jnp.asarray(x)[repeated], bodies)
     place = jax.jit(jax.vmap(rules.place))
@@ -116,7 +117,7 @@ def report_all(
 def compare(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """Placements in one compiled program, on one core and on all, and the bare loop."""
     engines = {"one core": MujocoC(num_steps, num_threads=1), "all cores": MujocoC(num_steps)}
-    inputs = placements(num_worlds, num_steps)
+    inputs = placements(num_worlds)
     loop = bare_loop(np.asarray(inputs(jax.random.key(0))[0]), num_steps)
     subjects = {name: m.compiled(engine.settle, inputs) for name, engine in engines.items()}
     subjects["bare loop"] = m.Subject(
@@ -130,7 +131,7 @@ def compare(report: m.Report, num_worlds: int, num_steps: int) -> None:
 
 def compare_mjx(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """MJX on the device that jax has, against the C engine on one core."""
-    inputs = placements(num_worlds, scene.SETTLE_STEPS if num_steps > 5 else num_steps)
+    inputs = placements(num_worlds)
     subjects = {
         "MJX": m.compiled(make_engine("mjx", settle_steps=num_steps).settle, inputs),
         "C, one core": m.compiled(MujocoC(num_steps, num_threads=1).settle, inputs),
@@ -143,7 +144,7 @@ def compare_mjx(report: m.Report, num_worlds: int, num_steps: int) -> None:
 
 def cached_compilation(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """What a second process would wait for, with a compilation cache on disk."""
-    arguments = placements(num_worlds, num_steps)(jax.random.key(0))
+    arguments = placements(num_worlds)(jax.random.key(0))
     costs = []
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_enable_compilation_cache", True)

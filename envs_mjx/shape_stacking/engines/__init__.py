@@ -1,6 +1,7 @@
 """Engines: what happens to the bodies in the 3 s after an action (spec shape_stacking 4, item 4).
 
-Each engine is a module of its own, imported by its name, since simulators take long to import.
+`make_engine` makes one by its name. Each is a module of its own, since simulators take long to
+import.
 """
 
 from __future__ import annotations

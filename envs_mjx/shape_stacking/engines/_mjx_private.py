@@ -1,9 +1,8 @@
 """Everything of mujoco-mjx that has no public name, and the versions that have it.
 
-MJX moves the bodies and solves for the contact forces; which bodies touch is found by this
-project's own code, since MJX wants shapes to be part of the program (spec shape_stacking 11.1).
-`_contact` of MJX's data is where the two meet. MJX's own state, its module globals included, is
-left alone.
+MJX moves the bodies and solves for the contact forces. Where bodies touch is found by this
+project's own code, since MJX wants shapes to be part of the program (spec shape_stacking 11.1);
+`_impl.contact` of MJX's data is where the two meet. Nothing of MJX is replaced or patched.
 """
 
 from __future__ import annotations
@@ -11,6 +10,7 @@ from __future__ import annotations
 import importlib
 import importlib.metadata
 import inspect
+from collections.abc import Callable
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -108,12 +108,7 @@ def private() -> SimpleNamespace:
     return SimpleNamespace(**found)
 
 
-def max_contacts(data: Any) -> int:
-    """How many contacts MJX's data has room for."""
-    return int(data._impl.contact.dim.shape[0])
-
-
-def step(model: Any, data: Any, find_contacts: Any) -> Any:
+def step(model: Any, data: Any, find_contacts: Callable[[Any], Contacts]) -> Any:
     """One physics step: `mjx.step`, but with contacts of our own.
 
     What this task's scene does not have is left out: tendons, actuators, sensors, cameras.
@@ -121,8 +116,8 @@ def step(model: Any, data: Any, find_contacts: Any) -> Any:
     Args:
       model: `mjx.Model`.
       data: `mjx.Data` of the JAX backend.
-      find_contacts: (`mjx.Data` with the poses of all bodies) -> `Contacts` in descending order
-        of overlap or at most `max_contacts(data)`.
+      find_contacts: (`mjx.Data` with the poses of all bodies) -> `Contacts`, any number; the
+        deepest of them are kept, as many as the data has room for.
 
     Returns:
       `mjx.Data` after the step.
@@ -136,7 +131,7 @@ def step(model: Any, data: Any, find_contacts: Any) -> Any:
 
 
 def _with_contacts(data: Any, contacts: Contacts) -> Any:
-    room = max_contacts(data)
+    room = len(data._impl.contact.dim)
     distance, position, normal, bodies = contacts
     if len(distance) > room:
         _, best = jax.lax.top_k(-distance, room)

@@ -30,7 +30,8 @@ class Mjx:
     Shapes are data: one compiled program per batch size serves all worlds and action sets. Spheres
     and capsules collide as such, all other shapes by the hulls of the library, cylinders among
     them, as 12-gons. Two hulls touch in up to four points, so towers do not creep; compare with
-    `MujocoC(has_multiple_contacts=True)`.
+    `MujocoC(has_multiple_contacts=True)`. Contacts are found by this project; their forces and the
+    motion are MJX's.
 
     Numbers are f32. A world's result depends on the batch around it, the device and the program it
     is part of by rounding only, which impacts magnify. Ids beyond the library cannot raise errors
