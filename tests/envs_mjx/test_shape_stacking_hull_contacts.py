@@ -131,7 +131,8 @@ def test_order_of_the_two_does_not_matter() -> None:
     swapped = Pairs(*(list(reversed(arrays)) for arrays in pairs))
     one, other = found(pairs), found(swapped)
     np.testing.assert_allclose(one.distance.min(axis=1), other.distance.min(axis=1), atol=3e-4)
-    assert np.median(np.abs(one.normal + other.normal).max(axis=1)) < 1e-5
+    # Where two directions are equally good, each order may take its own.
+    assert np.mean(np.abs(one.normal + other.normal).max(axis=1) < 1e-5) > 0.9
 
 
 @pytest.mark.unit

@@ -83,7 +83,7 @@ def hull_hull(one: Hull, two: Hull) -> tuple[jax.Array, jax.Array, jax.Array]:
     distance = jnp.where(is_edge, edge_distance, distance)
     position = jnp.where(is_edge, two.center + edge_position, position)
     normal = jnp.where(is_edge, edge_normal, jnp.where(is_first, normal, -normal))
-    return jnp.where(face_gap < 0.0, distance, APART), position, normal
+    return distance, position, normal
 
 
 def four_corners(
