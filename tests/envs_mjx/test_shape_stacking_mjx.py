@@ -186,41 +186,68 @@ def test_22_worlds_do_not_depend_on_the_others(engine: OneProgram) -> None:
     assert_near([fewer.qpos[:, :, 2]], [whole.qpos[order, :, 2]], 1e-4)
 
 
-@pytest.mark.contract
-def test_what_no_world_can_be_is_given_back(engine: OneProgram) -> None:
-    """The other worlds are as without them; unused bodies come back parked, whatever they were."""
-    ids, qpos, qvel = dropped(3, 12)
-    ids[:, 3] = -1
-    expected = engine.settle(ids, qpos, qvel)
-    assert expected.ok.all()
-    unused = ids < 0
-    parked = np.broadcast_to(scene.parked_qpos(), qpos.shape)
-    np.testing.assert_array_equal(expected.qpos[unused], parked[unused])
-    assert not expected.qvel[unused].any()
+def falling(seed: int) -> Arrays:
+    """Four worlds: a cylinder on the table, and one that hits it or the table within 0.6 s."""
+    ids, qpos, qvel = dropped(seed, 4, 2)
+    qpos[:, 0, 2] += 0.05
+    qpos[:, 1, 2] = 1.0
+    return ids, qpos, qvel
 
+
+@pytest.mark.contract
+def test_unused_bodies_come_back_parked_whatever_they_were(small: Mjx) -> None:
+    ids, qpos, qvel = falling(3)
+    ids[1, 0] = ids[2, 1] = -7
+    unused = ids < 0
     qpos[unused], qvel[unused] = np.nan, 1e30
-    ids[unused] = -7
-    qpos[1, 2, 0], qpos[2, 0, 2] = np.nan, 201.0
-    qvel[3, 4, 1], qvel[4, 1, 1], qvel[5, 2, 4] = np.inf, -51.0, 1001.0
-    ids[6, 2] = 810
-    ids[7, 5] = 690  # Beyond the slots of this engine.
-    found = engine.settle(ids, qpos, qvel)
-    bad = np.arange(1, 8)
-    np.testing.assert_array_equal(np.flatnonzero(~found.ok), bad)
-    np.testing.assert_array_equal(found.qpos[bad], qpos[bad])
-    np.testing.assert_array_equal(found.qvel[bad], qvel[bad])
-    good = [0, 8, 9, 10, 11]
-    assert_near([found.qpos[good]], [expected.qpos[good]], 1e-4)
+    settled = small.settle(ids, qpos, qvel)  # type: ignore[arg-type]
+    assert np.asarray(settled.ok).all()
+    parked = np.broadcast_to(scene.parked_qpos(), qpos.shape)
+    np.testing.assert_array_equal(np.asarray(settled.qpos)[unused], parked[unused])
+    assert not np.asarray(settled.qvel)[unused].any()
+    assert (np.asarray(settled.qpos)[~unused, 2] < qpos[~unused, 2]).all()
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize(
+    ("where", "value"),
+    [
+        *[("qpos", value) for value in (np.nan, 201.0)],
+        *[("qvel", value) for value in (np.inf, -51.0)],
+        *[("spin", 1001.0), ("id", 810), ("slot", 690)],
+    ],
+)
+def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float) -> None:
+    """A third body is beyond the slots of this engine. The other worlds are as without it."""
+    ids, qpos, qvel = falling(4)
+    expected = small.settle(ids, qpos, qvel)  # type: ignore[arg-type]
+    assert np.asarray(expected.ok).all()
+    places = {"qpos": qpos[1, 0, :1], "qvel": qvel[1, 1, 1:2], "spin": qvel[1, 0, 4:5]}
+    (places | {"id": ids[1, :1], "slot": ids[1, 2:3]})[where][:] = value
+    found = small.settle(ids, qpos, qvel)  # type: ignore[arg-type]
+    assert np.asarray(found.ok).tolist() == [True, False, True, True]
+    np.testing.assert_array_equal(found.qpos[1], qpos[1])
+    np.testing.assert_array_equal(found.qvel[1], qvel[1])
+    assert_near([found.qpos[2:]], [expected.qpos[2:]], 1e-5)
     # All these worlds went through one program.
-    assert engine.engine._jitted._cache_size() == 1
+    assert small._jitted._cache_size() == 1
+
+
+@pytest.mark.contract
+def test_worlds_that_get_too_fast_are_given_back(small: Mjx) -> None:
+    """49 m/s downwards, far above the table, is more than 50 after 0.3 s of fall."""
+    ids, qpos, qvel = falling(5)
+    ids[:, 0] = -1
+    qpos[0, 1, 2], qvel[0, 1, 2] = 150.0, -49.0
+    found = small.settle(ids, qpos, qvel)  # type: ignore[arg-type]
+    assert np.asarray(found.ok).tolist() == [False, True, True, True]
+    np.testing.assert_array_equal(found.qpos[0], qpos[0])
 
 
 @pytest.mark.contract
 def test_jit_vmap_and_scan_equal_direct_calls(small: Mjx) -> None:
     """And both follow C, in the fall and through the impact."""
-    ids, qpos, qvel = dropped(5, 4, 2)
-    qpos[:, 0, 2] += 0.05
-    qpos[:, 1, 2] = 1.0
+    ids, qpos, qvel = falling(5)
 
     def body(state: Any, _: Any) -> tuple[Any, Any]:
         shape = (2, 2)
