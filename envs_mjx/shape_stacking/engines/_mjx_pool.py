@@ -24,6 +24,9 @@ from envs_mjx.shape_stacking.solids import CLASS_NAMES
 class Limits:
     """How many pairs of bodies are looked at closely: those whose boxes overlap the deepest.
 
+    In 60 episodes of random play on C the boxes (along the world's axes) of at most 25 pairs of
+    hulls overlapped at a time, 23 in 99.9 % of 10,800 moments; of 9 and 1 of the other kinds.
+
     Attributes:
       hull_pairs, mixed_pairs, round_pairs: two hulls; a round body and a hull; two round bodies.
     """

@@ -7,9 +7,11 @@ project's own code, since MJX wants shapes to be part of the program (spec shape
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import importlib.metadata
 import inspect
+import io
 from collections.abc import Callable
 from functools import lru_cache
 from types import SimpleNamespace
@@ -18,9 +20,14 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from envs_mjx.shape_stacking import scene
+
+# It prints that it has no Warp, which nothing here uses.
+with contextlib.redirect_stdout(io.StringIO()):
+    from mujoco import mjx
+
+__all__ = ["Contacts", "check_version", "is_as_expected", "mjx", "private", "step"]
 
 WRITTEN_FOR = "3.17"
 

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import mujoco
-from mujoco import mjx
 
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines import Settled, _mjx_pool, _mjx_private, check_state
@@ -77,8 +76,8 @@ class Mjx:
         self.num_slots = num_slots
         self._limits = limits or Limits()
         model = mujoco.MjModel.from_xml_string(_scene_text(num_slots, solver, max_contacts))
-        self._model = mjx.put_model(model, impl="jax")
-        self._data = mjx.make_data(model, impl="jax")
+        self._model = _mjx_private.mjx.put_model(model, impl="jax")
+        self._data = _mjx_private.mjx.make_data(model, impl="jax")
         self._jitted = jax.jit(self._settle_flat)
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
