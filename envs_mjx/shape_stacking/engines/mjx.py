@@ -17,8 +17,8 @@ from envs_mjx.shape_stacking.engines._mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 
-# Line searches always take all their steps here. 8 and 12 end no tower otherwise, and fewer contacts
-# do: results/shape_stacking/mjx_speed.md.
+# Line searches always take all their steps here. With 8 and 12 no tower ends otherwise; with fewer
+# contacts some do: results/shape_stacking/mjx_speed.md.
 SOLVER = scene.Solver(iterations=5, ls_iterations=5)
 MAX_CONTACTS = 48
 
