@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import mujoco
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines import Settled, _mjx_pool, _mjx_private, check_state
+from envs_mjx.shape_stacking.engines import _mjx_pool, _mjx_private
+from envs_mjx.shape_stacking.engines._contract import Settled, check_state
 from envs_mjx.shape_stacking.engines._limits import is_plausible
 from envs_mjx.shape_stacking.engines._mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
