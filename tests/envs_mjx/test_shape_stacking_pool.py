@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
 from typing import NamedTuple
 
 import jax
@@ -11,6 +12,7 @@ import pytest
 
 from envs_mjx.shape_stacking import scene, shape_library
 from envs_mjx.shape_stacking.engines import _mjx_pool
+from envs_mjx.shape_stacking.engines._mujoco_pool import catalogue_model
 
 TABLE, FIRST, SECOND, THIRD = 0, 1, 2, 3
 CUBE, SPHERE, SMALL_SPHERE, CAPSULE = 690, 735, 726, 764
@@ -156,3 +158,22 @@ def test_boxes_around_bodies_tell_which_pairs_are_near() -> None:
     assert chosen.tolist() == [2]  # The deeper of the two, were these overlaps.
     assert is_near.tolist() == [True]
     assert not _mjx_pool._nearest(is_candidate, gaps, 2)[1].any()
+
+
+@pytest.mark.oracle
+def test_masses_are_those_that_mujoco_compiles() -> None:
+    """Every class and scale, as a body of its own in a compiled model."""
+    compiled = catalogue_model()
+    names = ("mass", "subtreemass", "inertia", "ipos", "iquat", "invweight0")
+    fields = {f"body_{name}": getattr(compiled, f"body_{name}") for name in names}
+
+    class Model(SimpleNamespace):
+        def replace(self, **values: jax.Array) -> dict[str, jax.Array]:
+            return values
+
+    ids = jnp.array([form.shape_id for form in scene.forms()[0]], jnp.int32)
+    empty = {name: jnp.zeros(values.shape) for name, values in fields.items()}
+    found = _mjx_pool.with_shapes(Model(**empty), ids)
+    assert set(found) == set(fields)
+    for name, values in fields.items():
+        np.testing.assert_allclose(found[name][1:], values[1:], rtol=1e-4, atol=1e-7)
