@@ -1,6 +1,7 @@
 """Every figure that the spec gives for Shape Stacking's physics, measured (spec 10 and 13).
 
     python -m experiments.stacking_figures > results/shape_stacking/engines.md
+    python -m experiments.stacking_figures --physics=mjx   # MJX beside MuJoCo's C engine.
 
 Anchors are policies that need no training. Their action sets are 20 shapes of all 810; the same
 episodes are played on each engine.
@@ -18,8 +19,7 @@ import numpy as np
 from absl import flags
 
 from envs_mjx.shape_stacking import rules, scene, shape_library
-from envs_mjx.shape_stacking.engines import Engine
-from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+from envs_mjx.shape_stacking.engines import Engine, make_engine
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 from experiments import _flags as flag
@@ -35,10 +35,17 @@ FLAT_TOPPED = (
     "cube",
     "cylinder",
 )
-ENGINES: dict[str, Callable[[], Engine]] = {
-    "one contact per pair of hulls": MujocoC,
-    "several": lambda: MujocoC(has_multiple_contacts=True),
-}
+# Two engines' values that are farther apart than this, m, are listed.
+_DIFFERENT_M = 0.005
+
+
+def engines_of(physics: str) -> dict[str, Engine]:
+    """The columns of the tables: C in both its forms, and for `mjx` that beside them."""
+    engines = {
+        "one contact per pair of hulls": make_engine("mujoco"),
+        "several": make_engine("mujoco", has_multiple_contacts=True),
+    }
+    return engines | ({"MJX": make_engine("mjx")} if physics == "mjx" else {})
 
 
 @dataclass(frozen=True)
@@ -141,16 +148,33 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
-def figures_table(engines: dict[str, Engine]) -> str:
+Columns = dict[str, list[stacking.Row]]
+
+
+def columns_of(engines: dict[str, Engine]) -> Columns:
+    """All figures on each engine."""
+    return {name: stacking.measured(engine) for name, engine in engines.items()}
+
+
+def figures_table(columns: Columns) -> str:
     """The checks; values that are off by more than the tolerance are bold."""
-    columns = [stacking.measured(engine) for engine in engines.values()]
     rows = []
-    for found in zip(*columns, strict=True):
+    for found in zip(*columns.values(), strict=True):
         first = found[0]
         spec = first.spec if isinstance(first.spec, str) else f"{first.spec:.3f}"
         tolerance = "" if first.tolerance is None else f"{first.tolerance:g}"
         rows.append([str(first.check), first.what, spec, tolerance, *map(_shown, found)])
-    return table(["check", "what", "spec", "tolerance", *engines], rows)
+    return table(["check", "what", "spec", "tolerance", *columns], rows)
+
+
+def differences_table(columns: Columns, one: str, other: str) -> str:
+    """The checks in which two engines differ by more than 5 mm (cosines: 0.005)."""
+    rows = [
+        [str(a.check), a.what, f"{a.value:.4f}", f"{b.value:.4f}", f"{b.value - a.value:+.4f}"]
+        for a, b in zip(columns[one], columns[other], strict=True)
+        if not abs(a.value - b.value) <= _DIFFERENT_M
+    ]
+    return table(["check", "what", one, other, "difference"], rows)
 
 
 def _shown(row: stacking.Row) -> str:
@@ -175,14 +199,21 @@ def anchors_table(engines: dict[str, Engine], episodes: int, seed: int) -> str:
 
 
 def main() -> None:
-    engines = {name: make() for name, make in ENGINES.items()}
-    version = importlib.metadata.version("mujoco")
+    physics, episodes = flags.FLAGS.physics, flags.FLAGS.episodes
+    engines = engines_of(physics)
+    version = importlib.metadata.version
+    names = [f"MuJoCo's C engine {version('mujoco')}"]
+    if physics == "mjx":
+        names.append(f"MJX {version('mujoco-mjx')} on {jax.devices()[0].device_kind}")
     print("# Shape Stacking: what the engines do\n")
     print(f"    python -m experiments.stacking_figures {' '.join(sys.argv[1:])}".rstrip())
-    print(f"\nMuJoCo's C engine {version}. Values beyond the tolerance are bold.\n")
+    print(f"\n{', '.join(names)}. Values beyond the tolerance are bold.\n")
     print("## Figures of the spec (m)\n")
-    print(figures_table(engines))
-    episodes = flags.FLAGS.episodes
+    columns = columns_of(engines)
+    print(figures_table(columns))
+    if physics == "mjx":
+        print("\n## Where MJX and C with several contacts differ by more than 0.005\n")
+        print(differences_table(columns, "several", "MJX"))
     print(f"\n## Policies without training, {episodes} episodes, mean +- standard error\n")
     print(anchors_table(engines, episodes, flag.SEED.value))
 
@@ -190,4 +221,10 @@ def main() -> None:
 if __name__ == "__main__":
     # Not at import: other commands have a flag of this name.
     flags.DEFINE_integer("episodes", 60, "Episodes of each anchor.", lower_bound=2)
+    flags.DEFINE_enum(
+        "physics",
+        "mujoco",
+        ["mujoco", "mjx"],
+        "mjx: MJX as well; on a CPU that takes half an hour.",
+    )
     flag.run_command(main)

@@ -206,7 +206,7 @@ def test_bad_arguments() -> None:
         ShapeStacking(Recorder(), position_dim=3)
     with pytest.raises(ValueError, match="reward_variant='both' must be one of"):
         ShapeStacking(Recorder(), reward_variant="both")
-    with pytest.raises(ValueError, match="physics='warp' is unknown; choose one of"):
+    with pytest.raises(ValueError, match="physics='warp' is unknown; choose from"):
         ShapeStacking("warp")
     with pytest.raises(ValueError, match=r"takes f32\[1\]"):
         STILL.step_env(jax.random.key(0), started(STILL), Action.of(690), STILL.default_params)

@@ -87,9 +87,21 @@ def test_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     )
     monkeypatch.setattr(stacking, "measured", lambda engine: next(rows))
     engine = MujocoC(settle_steps=1)
-    assert figures.figures_table({"a": engine, "b": engine}).splitlines() == [
+    columns = figures.columns_of({"a": engine, "b": engine})
+    assert figures.figures_table(columns).splitlines() == [
         "| check | what | spec | tolerance | a | b |",
         "| --- | --- | --- | --- | --- | --- |",
         "| 6 | cube: z1 | 0.482 | 0.005 | 0.4840 | **0.4880** |",
         "| 16 | cone: z2 | falls |  | 0.3000 | 0.9000 |",
     ]
+    assert figures.differences_table(columns, "a", "b").splitlines() == [
+        "| check | what | a | b | difference |",
+        "| --- | --- | --- | --- | --- |",
+        "| 16 | cone: z2 | 0.3000 | 0.9000 | +0.6000 |",
+    ]
+
+
+@pytest.mark.unit
+def test_engines_of_the_tables() -> None:
+    assert [e.name for e in figures.engines_of("mujoco").values()] == ["mujoco_c"] * 2
+    assert [e.name for e in figures.engines_of("mjx").values()] == ["mujoco_c"] * 2 + ["mjx"]

@@ -10,16 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines import Settled, check_state
+from envs_mjx.shape_stacking.engines._contract import Settled, check_state
+from envs_mjx.shape_stacking.engines._limits import is_plausible
 from envs_mjx.shape_stacking.engines._mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
-
-# In a settling of 3 s a body falls at most 44 m and reaches 29 m/s; the smallest sphere would then
-# roll at 370 rad/s. Parking ends at x = 53 and z = 100.
-MAX_DISTANCE_M = 200.0
-MAX_SPEED = 50.0
-MAX_SPIN = 1000.0
 
 _CAPACITY = 256
 
@@ -140,19 +135,6 @@ class MujocoC:
         ok = np.zeros(len(ids), bool)
         ok[sound] = True
         return ok
-
-
-def is_plausible(qpos: np.ndarray, qvel: np.ndarray) -> np.ndarray:
-    """bool[n] worlds with finite numbers whose bodies are neither too far nor too fast.
-
-    Args:
-      qpos: f64[n, 12, 7].
-      qvel: f64[n, 12, 6].
-    """
-    # Comparisons with NaN are false.
-    is_near = (np.abs(qpos) < MAX_DISTANCE_M).all(axis=(1, 2))
-    is_slow = (np.abs(qvel[..., :3]) < MAX_SPEED).all(axis=(1, 2))
-    return is_near & is_slow & (np.abs(qvel[..., 3:]) < MAX_SPIN).all(axis=(1, 2))
 
 
 def _available_cores() -> int:

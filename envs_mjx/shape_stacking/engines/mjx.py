@@ -1,0 +1,157 @@
+"""MJX's JAX backend: inside the program, on any device; shapes are data (spec 11.2)."""
+
+from __future__ import annotations
+
+import math
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+
+from envs_mjx.shape_stacking import scene
+from envs_mjx.shape_stacking.engines import _mjx_pool, _mjx_private
+from envs_mjx.shape_stacking.engines._contract import Settled, check_state
+from envs_mjx.shape_stacking.engines._limits import is_plausible
+from envs_mjx.shape_stacking.engines._mjx_pool import Limits
+from envs_mjx.shape_stacking.scene import NUM_SLOTS
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+
+# Line searches always take all their steps here. With 8 and 12 no tower ends otherwise; with fewer
+# contacts some do: results/shape_stacking/mjx_speed.md.
+SOLVER = scene.Solver(iterations=5, ls_iterations=5)
+MAX_CONTACTS = 48
+
+
+class Mjx:
+    """The engine of accelerators; see `engines.Engine` for what it promises.
+
+    Shapes are data: one compiled program per batch size serves all worlds and action sets. Spheres
+    and capsules collide as such, all other shapes by the hulls of the library, cylinders among
+    them, as 12-gons. Two hulls touch in up to four points, so towers do not creep; compare with
+    `MujocoC(has_multiple_contacts=True)`. Contacts are found by this project; their forces and the
+    motion are MJX's.
+
+    Numbers are f32. A world's result depends on the batch around it, the device and the program it
+    is part of by rounding only, which impacts magnify. Ids beyond the library cannot raise errors
+    inside a program; such worlds are not `ok`.
+
+    Attributes:
+      name: `mjx`.
+      settle_steps: physics steps of 0.01 s in one call.
+      num_slots: bodies that are simulated.
+    """
+
+    name = "mjx"
+
+    def __init__(
+        self,
+        settle_steps: int = scene.SETTLE_STEPS,
+        num_slots: int = NUM_SLOTS,
+        max_contacts: int = MAX_CONTACTS,
+        solver: scene.Solver = SOLVER,
+        limits: Limits | None = None,
+    ) -> None:
+        """
+        Args:
+          settle_steps: at least 1; 300 is the task's (spec 4).
+          num_slots: 2 to 12. Arrays have 12 rows whatever it is; with fewer slots, which is
+            cheaper, worlds that use a body beyond them are not `ok`.
+          max_contacts: points of contact in a world, at least 1; the deepest are kept.
+          solver: upper bounds of Newton's method.
+          limits: of the pairs of bodies that are looked at closely; None for the usual ones.
+
+        Raises:
+          ValueError: a number is out of its range.
+          ImportError: another version of mujoco-mjx than this was written for.
+        """
+        if settle_steps < 1:
+            raise ValueError(f"settle_steps={settle_steps} must be at least 1.")
+        if not 2 <= num_slots <= NUM_SLOTS:
+            raise ValueError(f"num_slots={num_slots} must be 2 to {NUM_SLOTS}.")
+        if max_contacts < 1:
+            raise ValueError(f"max_contacts={max_contacts} must be at least 1.")
+        _mjx_private.check_version()
+        self.settle_steps = settle_steps
+        self.num_slots = num_slots
+        self._limits = limits or Limits()
+        model = mujoco.MjModel.from_xml_string(_scene_text(num_slots, solver, max_contacts))
+        self._model = _mjx_private.mjx.put_model(model, impl="jax")
+        self._data = _mjx_private.mjx.make_data(model, impl="jax")
+        self._jitted = jax.jit(self._settle_flat)
+
+    def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
+        """Simulates `settle_steps` physics steps; arrays as in `engines.Engine.settle`.
+
+        Raises:
+          ValueError: arrays that do not fit together.
+          TypeError: wrong dtypes.
+        """
+        check_state(shape_ids, qpos, qvel)
+        batch = shape_ids.shape[:-1]
+        state = (shape_ids, qpos, qvel)
+        flat = [jnp.reshape(x, (math.prod(batch), *x.shape[len(batch) :])) for x in state]
+        return jax.tree.map(lambda x: x.reshape(*batch, *x.shape[1:]), self._jitted(*flat))
+
+    def _settle_flat(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
+        # Accelerators would multiply matrices in less than f32.
+        with jax.default_matmul_precision("highest"):
+            return jax.vmap(self._settle_one)(shape_ids, qpos, qvel)
+
+    def _settle_one(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
+        n, is_unused = self.num_slots, (shape_ids < 0)[:, None]
+        parked = jnp.asarray(scene.parked_qpos())
+        start_qpos = jnp.where(is_unused, parked, qpos)
+        start_qvel = jnp.where(is_unused, 0.0, qvel)
+        end_qpos, end_qvel = self._simulated(shape_ids[:n], start_qpos[:n], start_qvel[:n])
+        end_qpos = jnp.where(is_unused, parked, start_qpos.at[:n].set(end_qpos))
+        end_qvel = jnp.where(is_unused, 0.0, start_qvel.at[:n].set(end_qvel))
+        is_possible = (shape_ids < NUM_SHAPES).all() & is_unused[n:].all()
+        ok = is_possible & is_plausible(start_qpos, start_qvel) & is_plausible(end_qpos, end_qvel)
+        return Settled(jnp.where(ok, end_qpos, qpos), jnp.where(ok, end_qvel, qvel), ok)
+
+    def _simulated(
+        self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array
+    ) -> tuple[jax.Array, jax.Array]:
+        """One world from a cold start; arrays [num_slots, ...]."""
+        step = partial(
+            _step,
+            _mjx_pool.with_shapes(self._model, shape_ids),
+            self._data,
+            _mjx_pool.pool(shape_ids),
+            self._limits,
+        )
+        start = (qpos.ravel(), qvel.ravel(), jnp.zeros(qvel.size))
+        end = jax.lax.fori_loop(0, self.settle_steps, lambda _, state: step(state), start)
+        return end[0].reshape(qpos.shape), end[1].reshape(qvel.shape)
+
+
+_State = tuple[jax.Array, jax.Array, jax.Array]
+
+
+def _step(model: Any, data: Any, pool: _mjx_pool.Pool, limits: Limits, state: _State) -> _State:
+    """One physics step of qpos, qvel and the last accelerations, flat."""
+
+    def find(data: Any) -> _mjx_private.Contacts:
+        return _mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
+
+    qpos, qvel, acceleration = state
+    data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=acceleration)
+    data = _mjx_private.step(model, data, find)
+    return data.qpos, data.qvel, data.qacc_warmstart
+
+
+def _scene_text(num_slots: int, solver: scene.Solver, max_contacts: int) -> str:
+    """A box stands for every shape, since MJX keeps room for four contacts of each two boxes."""
+    inertial, box = scene.inertial_text(0), ['<geom type="box" size="0.1 0.1 0.1"/>']
+    bodies = [
+        scene.body_text(f"slot-{k}", inertial, box, qpos)
+        for k, qpos in enumerate(scene.parked_qpos()[:num_slots])
+    ]
+    # Nothing here has damping, which Euler's method would invert the masses once more for.
+    extra = (
+        '<option jacobian="dense"><flag eulerdamp="disable"/></option>'
+        f'<custom><numeric name="max_contact_points" data="{max_contacts}"/></custom>'
+    )
+    return scene.scene_text(bodies, solver=solver, extra=extra)

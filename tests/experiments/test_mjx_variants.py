@@ -1,0 +1,49 @@
+"""The comparison of MJX's variants: its worlds, and the cells of its table."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from envs_mjx.shape_stacking import scene, shape_library
+from envs_mjx.shape_stacking.engines import Settled
+from experiments.benchmarks import mjx_variants as variants
+
+
+@pytest.fixture(scope="module")
+def at() -> variants.Scenes:
+    return variants.scenes(worlds=2, steps=5)
+
+
+@pytest.mark.unit
+def test_worlds_are_of_three_stages_and_of_every_class(at: variants.Scenes) -> None:
+    ids, qpos, qvel = at.state
+    assert ids.shape == (2 * 3 + 16, 12)
+    np.testing.assert_array_equal((ids >= 0).sum(axis=1), [6, 6, 9, 9, 12, 12] + [1] * 16)
+    np.testing.assert_array_equal(shape_library().class_labels[at.rests], np.arange(16))
+    np.testing.assert_array_equal(ids[6:, 0], at.rests)
+    assert not qvel.any()
+    for row, slot in zip(range(6), (5, 5, 8, 8, 11, 11), strict=True):
+        z = np.where(ids[row] >= 0, qpos[row, :, 2], -1.0)
+        assert z[slot] == z.max()
+        assert at.reference[row, slot, 2] < z[slot]  # It has begun to fall.
+
+
+@pytest.mark.unit
+def test_cells_by_hand(at: variants.Scenes) -> None:
+    """C's own state but for the rests; one body sinks 0.02 m, one tower grows by 0.06 m."""
+    qpos = at.reference.copy()
+    ids = at.state[0]
+    base = shape_library().base[at.rests]
+    qpos[-16:, 0, 2] = scene.TABLE_HEIGHT - base
+    qpos[-3, 0, 2] -= 0.0015
+    qpos[0, 0, 2] -= 0.02
+    tallest = np.where(ids[1] >= 0, qpos[1, :, 2], -1.0).argmax()
+    qpos[1, tallest, 2] += 0.06
+    ok = jnp.ones(len(ids), bool).at[2].set(False)
+    cells = variants.outcome(Settled(jnp.asarray(qpos), jnp.zeros(1), ok), at)
+    num_bodies = 2 * (6 + 9 + 12)
+    # Six towers, one 0.06 higher: 0.01 on average, deviation 0.0245 over sqrt(6).
+    expected = ["1.50", f"{1 - 2 / num_bodies:.1%}", "83%", "+0.010 +- 0.010", "1"]
+    assert cells == expected
