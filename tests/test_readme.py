@@ -12,10 +12,13 @@ README = (ROOT / "README.md").read_text()
 
 
 @pytest.mark.integration
-def test_the_environment_example(capsys: pytest.CaptureFixture[str]) -> None:
-    (example,) = re.findall(r"```python\n(.+?)```", README, re.DOTALL)
-    exec(compile(example, "README.md", "exec"), {})
+def test_the_environments_examples(capsys: pytest.CaptureFixture[str]) -> None:
+    grid_world, stacking = re.findall(r"```python\n(.+?)```", README, re.DOTALL)
+    exec(compile(grid_world, "README.md", "exec"), {})
     assert capsys.readouterr().out == "50 (81,)\n"
+    exec(compile(stacking, "README.md", "exec"), {})
+    # Shape 290 bridges the cylinders (spec shape_stacking 13, check 7), or lies on one of them.
+    assert 0.9 < float(capsys.readouterr().out) < 1.2
 
 
 @pytest.mark.unit
