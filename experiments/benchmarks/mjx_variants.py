@@ -221,9 +221,11 @@ def main() -> None:
     print("Processor time of all threads; other work may have run on the machine.\n")
     print(figures.table(HEADER, rows))
     print(
-        "\nSteps until all bodies of a world of random play are slow for good (below 0.01 m/s and"
+        "\nHeights: mean over random play and its standard error. Steps until all bodies of such a"
     )
-    print(f"rad/s, in C): {quiet_after(at, steps)}.")
+    print(
+        f"world are slow for good (below {_QUIET:g} m/s and rad/s, in C): {quiet_after(at, steps)}."
+    )
 
 
 if __name__ == "__main__":
