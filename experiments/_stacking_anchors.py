@@ -14,7 +14,9 @@ import numpy as np
 from flax import struct
 
 from envs_mjx.shape_stacking import ShapeStacking, StackingParams, StackingState, shape_library
+from envs_mjx.shape_stacking.camera import FRAME_SIZE
 from envs_mjx.shape_stacking.engines import Engine
+from envs_mjx.shape_stacking.rules import Bodies
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 from experiments._anchors import Summary
 from experiments._artifacts import Domain
@@ -64,6 +66,11 @@ class OpenStacking(ShapeStacking):
         _, stacking = super().reset_env(key, params)
         state = OpenState(stacking, stacking.bodies.qpos[0, 0])
         return _seen(state), state
+
+    def picture(self, bodies: Bodies, num_bodies: int = 0) -> jax.Array:
+        """Black: nobody looks at it."""
+        del bodies, num_bodies
+        return jnp.zeros((FRAME_SIZE, FRAME_SIZE), jnp.uint8)
 
     def step_env(
         self, key: jax.Array, state: Any, action: Action, params: StackingParams
