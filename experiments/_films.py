@@ -44,6 +44,7 @@ class FilmedEpisode:
       action_ids: what was chosen.
       metrics: at its end.
       frames: uint8[height, width, 3] each.
+      page: HTML, if it was asked for.
     """
 
     number: int
@@ -51,6 +52,7 @@ class FilmedEpisode:
     action_ids: Sequence[int]
     metrics: dict[str, float]
     frames: Sequence[np.ndarray]
+    page: str | None = None
 
     @property
     def outcome(self) -> str:
@@ -82,11 +84,13 @@ def film_run(
     suffix: str = ".gif",
     title: str = "",
     num_workers: int = 0,
+    with_pages: bool = False,
 ) -> list[Path]:
     """Films of the best checkpoint's first episodes on sets of test actions.
 
     Into `out/success` and `out/failure` go, for every episode, its film, its first and its last
-    picture; earlier ones are removed. Beside `out`, a sheet of the last pictures and a table.
+    picture, and its page; earlier ones are removed. Beside `out`, a sheet of the last pictures and
+    a table.
 
     Args:
       path: a run of `train` or a member of `sweep`.
@@ -96,19 +100,21 @@ def film_run(
       suffix: .gif or .mp4.
       title: of the sheet.
       num_workers: processes for environments; 0: one per core.
+      with_pages: whether to make an interactive page of each episode as well.
 
     Returns:
       The sheet, the table and the films.
 
     Raises:
-      UsageError: the task's episodes cannot be drawn.
+      UsageError: the task's episodes cannot be drawn, or not as pages.
+      ImportError: a package that films or pages need is missing.
       RuntimeError: an episode went another way when it was played again.
     """
     run, trainer, _ = load_trainer(path, num_workers)
     task = trainer.task
     with closing(trainer):
         state, _ = load_state(run, trainer, "best")
-        episodes = filmed(trainer, state, count, size)
+        episodes = filmed(trainer, state, count, size, with_pages)
         clear(out)
         rows, stills, films = [], [], []
         for episode in episodes:
@@ -141,17 +147,21 @@ def _row(episode: FilmedEpisode, film: Path) -> dict[str, Any]:
     }
 
 
-def filmed(trainer: Trainer, state: TrainState, count: int, size: int) -> Iterator[FilmedEpisode]:
+def filmed(
+    trainer: Trainer, state: TrainState, count: int, size: int, with_pages: bool = False
+) -> Iterator[FilmedEpisode]:
     """The first episodes on sets of test actions; each is drawn when it is asked for.
 
     Raises:
-      UsageError: the task's episodes cannot be drawn.
+      UsageError: the task's episodes cannot be drawn, or not as pages.
     """
     host, filming = trainer.task.host, trainer.task.filming
+    if with_pages and (filming is None or filming.make_page is None):
+        raise UsageError(f"Task {trainer.task.name} has no interactive pages; omit --film_pages.")
     if host is not None and host.make_film is not None:
         return _filmed_on_host(host.make_film, trainer, state, count, size)
     if filming is not None:
-        return _filmed_inside_jit(filming, trainer, state, count, size)
+        return _filmed_inside_jit(filming, trainer, state, count, size, with_pages)
     raise UsageError(f"Episodes of task {trainer.task.name} cannot be filmed.")
 
 
@@ -167,12 +177,20 @@ def _filmed_on_host(
 
 
 def _filmed_inside_jit(
-    filming: Filming, trainer: Trainer, state: TrainState, count: int, size: int
+    filming: Filming,
+    trainer: Trainer,
+    state: TrainState,
+    count: int,
+    size: int,
+    with_pages: bool,
 ) -> Iterator[FilmedEpisode]:
     env = trainer.evaluator.env
     for e in play_episodes(trainer, state, "test", 0, count):
         frames = filming.draw(env, e.states, e.actions, e.rewards, size=size)
-        yield FilmedEpisode(e.number, e.is_success, e.action_ids, e.metrics, frames)
+        page = None
+        if with_pages and filming.make_page is not None:
+            page = filming.make_page(env, e.states, e.actions)
+        yield FilmedEpisode(e.number, e.is_success, e.action_ids, e.metrics, frames, page)
 
 
 def clear(out: Path) -> None:
@@ -184,10 +202,12 @@ def clear(out: Path) -> None:
 
 
 def write_episode(episode: FilmedEpisode, out: Path, suffix: str) -> Path:
-    """An episode's film, and beside it its first and its last picture; returns the film."""
+    """An episode's film; beside it its first and last picture and its page. Returns the film."""
     stem = out / episode.outcome / _FILE.format(episode.number)
     for word, frame in (("start", episode.frames[0]), ("end", episode.frames[-1])):
         Image.fromarray(frame).save(stem.with_name(f"{stem.name}-{word}.png"))
+    if episode.page is not None:
+        stem.with_suffix(".html").write_text(episode.page, encoding="utf-8")
     return write_video(episode.frames, stem.with_suffix(suffix))
 
 

@@ -7,7 +7,6 @@ by run.
 from __future__ import annotations
 
 import math
-import os
 import shlex
 import signal
 import subprocess
@@ -22,6 +21,7 @@ from experiments._flags import UsageError
 from experiments._methods import file_name
 from experiments._plots import amount
 from experiments._production import Cell, Source
+from jaxnew.cores import available_cores
 from jaxnew.task import StageTwoBudget
 
 
@@ -198,8 +198,7 @@ def training_seconds(source: Source, method: str, steps: float, num_runs: int) -
     if measured is None:
         return None
     rate = measured.training.get(method, measured.training["ours"])
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else 1
-    devices = max(n for n in range(1, cores + 1) if num_runs % n == 0)
+    devices = max(n for n in range(1, available_cores() + 1) if num_runs % n == 0)
     return steps / (rate * devices)
 
 

@@ -59,6 +59,7 @@ def define_flags() -> None:
     flags.DEFINE_integer("films", 20, "Episodes that figure 8 shows.", lower_bound=1)
     flags.DEFINE_integer("film_size", 512, "Pixels of their side.", lower_bound=16)
     flags.DEFINE_enum("film_format", "gif", ["gif", "mp4"], "Of their files; mp4: jaxnew[video].")
+    flags.DEFINE_bool("film_pages", False, "Interactive pages as well, of stacking; needs Brax.")
 
 
 def make(values: Any) -> list[Path]:
@@ -121,9 +122,13 @@ def film_given(values: Any) -> list[Path]:
     (group,) = group_runs([run])
     out = Path(values.out) if values.out else run.path / "figures"
     title = f"Figure 8, {environment_of([group])}: {group.label}"
-    suffix = f".{values.film_format}"
-    size, workers = values.film_size, flag.WORKERS.value
-    return film_run(run.path, out / "figure_8", values.films, size, suffix, title, workers)
+    return films_of(run.path, out / "figure_8", title, flag.WORKERS.value, values)
+
+
+def films_of(path: Path, out: Path, title: str, workers: int, values: Any) -> list[Path]:
+    """The films of a run, as the flags of figure 8 say."""
+    suffix, with_pages = f".{values.film_format}", values.film_pages
+    return film_run(path, out, values.films, values.film_size, suffix, title, workers, with_pages)
 
 
 def settings_of(figure: PaperFigure, source: Source) -> list[Setting]:
@@ -209,8 +214,7 @@ def draw(
     first, _ = settings[0]
     if figure.kind == "films":
         (run,) = groups[0].runs
-        size, suffix = values.film_size, f".{values.film_format}"
-        return film_run(run.path, out / name, values.films, size, suffix, title, first.workers)
+        return films_of(run.path, out / name, title, first.workers, values)
     if figure.kind == "study":
         paths = [run.path for group in groups for run in group.runs]
         study = study_runs(figure.study, paths, (), values.episodes, num_workers=first.workers)

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import itertools
 import json
-import os
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -35,6 +34,7 @@ from experiments._training import (
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.checkpoint import Checkpointer
+from jaxnew.cores import available_cores
 from jaxnew.evaluation import Evaluator
 from jaxnew.metrics import MetricsLog, read
 from jaxnew.ppo import Hyperparameters, TrainState
@@ -231,9 +231,7 @@ class Sweep:
 
 def main() -> None:
     # Each core is a device; without effect on accelerators.
-    has_affinity = hasattr(os, "sched_getaffinity")  # Not on macOS.
-    num_cores = len(os.sched_getaffinity(0)) if has_affinity else os.cpu_count() or 1
-    jax.config.update("jax_num_cpu_devices", num_cores)
+    jax.config.update("jax_num_cpu_devices", available_cores())
     task = flag.load_task(flag.TASK.value)
     if task.host is not None:
         raise flag.UsageError(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -12,6 +11,7 @@ import jax
 import numpy as np
 
 from jaxnew.actions import ActionSplit, ActionUniverse
+from jaxnew.cores import available_cores
 from jaxnew.environment import Action, ActionSpec, Environment, ObservationSpec
 from jaxnew.observations import RecordBlock, RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
@@ -233,12 +233,26 @@ class DrawEpisode(Protocol):
     ) -> list[np.ndarray]: ...
 
 
+class MakePage(Protocol):
+    """An episode of an environment inside jit as an interactive page.
+
+    Args:
+      env, states, actions: as of `DrawEpisode`.
+
+    Returns:
+      HTML.
+    """
+
+    def __call__(self, env: Any, states: Sequence[Any], actions: Sequence[Action]) -> str: ...
+
+
 @dataclass(frozen=True)
 class Filming:
     """How episodes of an environment inside jit are shown.
 
     Attributes:
       draw: see `DrawEpisode`.
+      make_page: see `MakePage`; None where there is none.
       success_from: an episode whose `Task.selection_metric` is at least this is a success.
       criterion: the same in words, where the metric is not success itself. The sheet of an
         evaluation's last pictures then shows the best and the worst of them.
@@ -247,6 +261,7 @@ class Filming:
     draw: DrawEpisode
     success_from: float = 1.0
     criterion: str = ""
+    make_page: MakePage | None = None
 
 
 @dataclass(frozen=True)
@@ -299,8 +314,7 @@ class HostDomain:
           num_workers: processes; 0 for one per core. At most one for each environment of a half.
         """
         num_halves = 1 if num_envs % 2 else 2
-        cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-        num_workers = min(num_workers or cores or 1, num_envs // num_halves)
+        num_workers = min(num_workers or available_cores(), num_envs // num_halves)
         make = partial(
             self.make_pool,
             num_envs=num_envs,

@@ -19,7 +19,7 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 LAYERS = (
     {
         *("actions", "observations"),
-        *("checkpoint", "config", "metrics", "run_directory"),
+        *("checkpoint", "config", "cores", "metrics", "run_directory"),
     },
     {"sampling", "environment"},
     {"policy", "representation"},
@@ -33,7 +33,15 @@ HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
     "mujoco": {"envs_mjx.shape_stacking"},
 }
-HOST_MAY_IMPORT = {"envs_host", "numpy", "pymunk", "gymnasium", "PIL", "jaxnew.actions"}
+HOST_MAY_IMPORT = {
+    "envs_host",
+    "numpy",
+    "pymunk",
+    "gymnasium",
+    "PIL",
+    "jaxnew.actions",
+    "jaxnew.cores",
+}
 
 
 def module_name(path: Path, root: Path = ROOT) -> str:
@@ -134,7 +142,8 @@ def why_not(module: str, package: str, name: str) -> str | None:
         if is_within(name, {"jaxnew"}):
             return why_not_within_jaxnew(module, name)
     if package == "envs_mjx" and is_ours(name):
-        allowed = {"envs_mjx", "jaxnew.actions", "jaxnew.observations", "jaxnew.environment"}
+        ours = {"actions", "cores", "environment", "observations"}
+        allowed = {"envs_mjx", *(f"jaxnew.{name}" for name in ours)}
         if not is_within(name, allowed):
             return f"envs_mjx may import {sorted(allowed)} of ours"
     if package == "examples" and is_ours(name) and not is_within(name, {"examples", "jaxnew"}):

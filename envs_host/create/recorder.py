@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import atexit
 import math
-import os
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -14,6 +13,7 @@ from envs_host.create.play import NUM_STATES, STATE_SIZE, PlayConfig, record_blo
 from envs_host.create.poses import POSES_SHAPE, record_poses
 from envs_host.pool import HostPool
 from envs_host.protocol import Step
+from jaxnew.cores import available_cores
 
 
 class _Kind(NamedTuple):
@@ -117,7 +117,7 @@ class PoolRecorder:
     def _pool_for(self, seed: int, num_recordings: int) -> HostPool:
         if self._pool is None or self._made_for != (seed, num_recordings):
             self.close()
-            workers = self._num_workers or len(os.sched_getaffinity(0))
+            workers = self._num_workers or available_cores()
             self._pool = HostPool(
                 "envs_host.create.recorder:Recorder",
                 {"seed": seed, "num_recordings": num_recordings, **self._settings},

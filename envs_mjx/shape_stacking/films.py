@@ -55,6 +55,43 @@ def draw_episode(
       ValueError: the numbers of states and actions do not belong together.
     """
     del rewards
+    camera = task_camera(env.position_dim)
+    return [draw_bodies(bodies, camera, size) for bodies in seen(env, states, actions)]
+
+
+def episode_page(
+    env: ShapeStacking, states: Sequence[StackingState], actions: Sequence[Action]
+) -> str:
+    """The same moments as a page that turns under the mouse; see `viewer.tower_html`.
+
+    Args:
+      env, states, actions: as in `draw_episode`.
+
+    Raises:
+      ValueError: the numbers of states and actions do not belong together.
+      ImportError: Brax is missing.
+    """
+    from envs_mjx.shape_stacking.viewer import tower_html  # Imports Brax.
+
+    shown = seen(env, states, actions)
+    poses = np.stack([np.asarray(bodies.qpos) for bodies in shown])
+    return tower_html(shown[-1].shape_ids, poses, FRAME_STEPS * scene.TIMESTEP_S)
+
+
+def seen(
+    env: ShapeStacking, states: Sequence[StackingState], actions: Sequence[Action]
+) -> list[Bodies]:
+    """The bodies at every moment that a film of an episode shows.
+
+    Args:
+      env, states, actions: as in `draw_episode`.
+
+    Returns:
+      One world each. Times in which nothing moves are left out.
+
+    Raises:
+      ValueError: the numbers of states and actions do not belong together.
+    """
     if len(states) != len(actions) + 1:
         raise ValueError(
             f"{len(states)} states and {len(actions)} actions; T actions need T + 1 states."
@@ -70,8 +107,7 @@ def draw_episode(
             if has_moved(shown[-1], bodies):
                 shown.append(bodies)
         shown.append(_on_host(states[t + 1].bodies))
-    camera = task_camera(env.position_dim)
-    return [draw_bodies(bodies, camera, size) for bodies in shown]
+    return shown
 
 
 def let_go(state: StackingState, after: StackingState, action: Action) -> Bodies:

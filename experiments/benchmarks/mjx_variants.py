@@ -12,7 +12,7 @@ from __future__ import annotations
 import contextlib
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 from unittest import mock
 
@@ -21,13 +21,15 @@ import jax.numpy as jnp
 import numpy as np
 from absl import flags
 
-from envs_mjx.shape_stacking import rules, scene, shape_library
+from envs_mjx.shape_stacking import hulls, rules, scene, shape_library
 from envs_mjx.shape_stacking.engines import Settled, _mjx_pool
 from envs_mjx.shape_stacking.engines._hull_contacts import APART
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts
 from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+from envs_mjx.shape_stacking.polyhedra import Polyhedron, prism, pyramid
 from envs_mjx.shape_stacking.scene import Solver
+from envs_mjx.shape_stacking.solids import DOME_AXIS_HEIGHT, solids
 from experiments import _stacking as stacking
 from experiments import stacking_figures as figures
 from experiments.benchmarks import _measure as m
@@ -51,8 +53,8 @@ def _mjx_hull_pairs(
     i, j = _mjx_pool._pairs(len(centers))
     chosen, is_near = _mjx_pool._nearest(pool.is_hull[i] & pool.is_hull[j], gaps, limit)
     first, second = jnp.asarray(i)[chosen], jnp.asarray(j)[chosen]
-    hulls = (_mjx_pool._hull(pool, which, centers, axes) for which in (first, second))
-    distance, position, normal = jax.vmap(_convex_convex)(*hulls)
+    both = (_mjx_pool._hull(pool, which, centers, axes) for which in (first, second))
+    distance, position, normal = jax.vmap(_convex_convex)(*both)
     distance = jnp.where(is_near[:, None], distance, APART)
     return _mjx_pool._contacts(distance, position, normal, first + 1, second + 1)
 
@@ -60,6 +62,36 @@ def _mjx_hull_pairs(
 @contextlib.contextmanager
 def _hulls_by_mjx() -> Iterator[None]:
     with mock.patch.object(_mjx_pool, "_hull_pairs", _mjx_hull_pairs):
+        yield
+
+
+def _coarse_hull(name: str) -> Polyhedron | None:
+    """8-gons of the unit circle's area for cylinders and cones, 6 chords for the dome's arc."""
+    angles = np.linspace(0.0, 2.0 * np.pi, 8, endpoint=False)
+    radius = np.sqrt(np.pi / (4.0 * np.sin(np.pi / 4.0)))  # Area: 4 R^2 sin(45 degrees).
+    polygon = radius * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    if name == "cylinder":
+        return prism(polygon, axis=2)
+    if name in ("cone", "cone-hires"):
+        return pyramid(polygon)
+    if name == "dome":
+        angles = np.linspace(0.0, np.pi, 7)
+        return prism(np.stack([np.cos(angles), np.sin(angles) + DOME_AXIS_HEIGHT], -1), axis=1)
+    return None
+
+
+@contextlib.contextmanager
+def _coarse_hulls() -> Iterator[None]:
+    with mock.patch.multiple(
+        hulls, MAX_VERTICES=16, MAX_FACES=10, MAX_FACE_VERTICES=8, MAX_EDGES=24
+    ):
+        rows = [
+            hulls._row(replace(solid, hull=_coarse_hull(solid.name) or solid.hull))
+            for solid in solids()
+        ]
+    table = hulls.HullTable(**{key: np.stack([row[key] for row in rows]) for key in rows[0]})
+    constants = _mjx_pool._constants() | _mjx_pool.hull_constants(table)
+    with mock.patch.object(_mjx_pool, "_constants", return_value=constants):
         yield
 
 
@@ -89,6 +121,9 @@ def _variants() -> list[Variant]:
         Variant("solver 2/3", {"solver": Solver(2, 3)}),
         Variant("solver 5/5, tolerance 1e-6", {"solver": Solver(5, 5, 1e-6)}),
         Variant("32 contacts", {"max_contacts": 32}),
+        Variant("24 contacts", {"max_contacts": 24}),
+        Variant("32 contacts, solver 2/3", {"max_contacts": 32, "solver": Solver(2, 3)}),
+        Variant("8-gons for cylinders and cones, 6 chords for domes", patch=_coarse_hulls),
         Variant("16, 12 and 6 pairs", {"limits": _mjx_pool.Limits(16, 12, 6)}),
         Variant("1 pair of each kind (no physics)", {"limits": _mjx_pool.Limits(1, 1, 1)}),
     ]

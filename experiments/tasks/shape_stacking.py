@@ -12,7 +12,7 @@ from operator import attrgetter
 from typing import Literal
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
-from envs_mjx.shape_stacking.films import draw_episode
+from envs_mjx.shape_stacking.films import draw_episode, episode_page
 from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.observations import RecordingFormat
@@ -190,6 +190,7 @@ _FILMING = Filming(
     draw_episode,
     success_from=1.3,
     criterion="at least 1.3 m, the mean of random play that never stops",
+    make_page=episode_page,
 )
 
 

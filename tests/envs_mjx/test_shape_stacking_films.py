@@ -8,7 +8,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs_mjx.shape_stacking import ShapeStacking, StackingState, films, rules, scene, shape_library
+from envs_mjx.shape_stacking import (
+    ShapeStacking,
+    StackingState,
+    films,
+    rules,
+    scene,
+    shape_library,
+    viewer,
+)
 from envs_mjx.shape_stacking.camera import task_camera
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.rules import Bodies
@@ -141,6 +149,26 @@ def test_a_film_falls_rests_and_ends_with_the_state(
     np.testing.assert_array_equal(shown[-1].qpos, last.qpos)
     with pytest.raises(ValueError, match="3 states and 1 actions; T actions need"):
         films.draw_episode(env, states, actions[:1], [0.0])
+
+
+@pytest.mark.unit
+def test_a_page_holds_what_a_film_shows(engine: MujocoC, monkeypatch: pytest.MonkeyPatch) -> None:
+    env = ShapeStacking(engine)
+    start = rules.start(799, 0.0, 1.3)
+    first = films._on_host(dropped(engine, start, SLOT, CUBE, -0.65))
+    states, actions = [state_of(start), state_of(first, 1)], [action(CUBE, -0.65)]
+    given: list[tuple[np.ndarray, np.ndarray, float]] = []
+    monkeypatch.setattr(viewer, "tower_html", lambda *page: given.append(page) or "page")
+    assert films.episode_page(env, states, actions) == "page"
+    ((ids, qpos, seconds),) = given
+    np.testing.assert_array_equal(ids, first.shape_ids)
+    shown = films.seen(env, states, actions)
+    np.testing.assert_array_equal(qpos, np.stack([bodies.qpos for bodies in shown]))
+    assert len(qpos) > 5
+    assert seconds == pytest.approx(0.06)
+    np.testing.assert_array_equal(qpos[0, SLOT], scene.parked_qpos()[SLOT])
+    with pytest.raises(ValueError, match="2 states and 0 actions"):
+        films.episode_page(env, states, [])
 
 
 @pytest.mark.golden

@@ -238,19 +238,23 @@ def test_which_run_is_filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     monkeypatch.setattr(_paper_figures, "film_run", lambda *given: made.append(given) or [])
     config = {**plain_config(), "task": "create-push", "representation": "hvae"}
     path = write_run(tmp_path / "run", config)
-    values = SimpleNamespace(run=[str(path)], out=None, films=3, film_size=64, film_format="mp4")
+    values = SimpleNamespace(run=[str(path)], out=None, films=3, film_size=64)
+    values.film_format, values.film_pages = "mp4", True
     with flagged(task="create-push"):
         _paper_figures.film_given(values)
         title = "Figure 8, CREATE Push: ours, hvae"
-        assert made == [(path, path / "figures" / "figure_8", 3, 64, ".mp4", title, 0)]
+        assert made == [(path, path / "figures" / "figure_8", 3, 64, ".mp4", title, 0, True)]
         values.run *= 2
         with pytest.raises(UsageError, match="Figure 8 shows one run; 2 were given"):
             _paper_figures.film_given(values)
     values.run = [str(path)]
     with flagged(task="create-seesaw"), pytest.raises(UsageError, match="of task create-seesaw"):
         _paper_figures.film_given(values)
+    shop = untrained(tmp_path / "shop", "recommender", "product")[0]
     with pytest.raises(UsageError, match="Episodes of task recommender cannot be filmed"):
-        film_run(untrained(tmp_path / "shop", "recommender", "product")[0], tmp_path / "out", 1)
+        film_run(shop, tmp_path / "out", 1)
+    with pytest.raises(UsageError, match="recommender has no interactive pages"):
+        film_run(shop, tmp_path / "out", 1, with_pages=True)
     assert not (tmp_path / "out").exists()
 
 

@@ -5,9 +5,10 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.spatial import ConvexHull
 
 from envs_mjx.shape_stacking import scene, shape_library
-from envs_mjx.shape_stacking.engines import Settled
+from envs_mjx.shape_stacking.engines import Settled, _mjx_pool
 from experiments.benchmarks import mjx_variants as variants
 
 
@@ -28,6 +29,24 @@ def test_worlds_are_of_three_stages_and_of_every_class(at: variants.Scenes) -> N
         z = np.where(ids[row] >= 0, qpos[row, :, 2], -1.0)
         assert z[slot] == z.max()
         assert at.reference[row, slot, 2] < z[slot]  # It has begun to fall.
+
+
+@pytest.mark.unit
+def test_coarse_hulls_have_the_cross_section_of_the_fine_ones() -> None:
+    library = shape_library()
+    cylinder, cone, cube = 794, 404, 684
+    ids = jnp.array([cylinder, cone, cube])
+    with variants._coarse_hulls():
+        found = _mjx_pool.pool(ids)
+    fine = _mjx_pool.pool(ids)
+    assert (found.vertices.shape, fine.vertices.shape) == ((3, 16, 3), (3, 24, 3))
+    for k, i in enumerate(np.asarray(ids)):
+        volume, expected = (ConvexHull(pool.vertices[k]).volume for pool in (found, fine))
+        assert volume == pytest.approx(expected, rel=1e-5), i
+    assert library.s[cylinder] ** 3 * 2.0 * np.pi == pytest.approx(
+        ConvexHull(found.vertices[0]).volume, rel=1e-5
+    )
+    assert found.face_normals.shape == (3, 10, 3)
 
 
 @pytest.mark.unit

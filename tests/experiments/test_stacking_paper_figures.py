@@ -337,7 +337,7 @@ def test_films_of_towers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     monkeypatch.setattr(_films, "load_trainer", load)
     monkeypatch.setattr(_films, "play_episodes", play)
     out = tmp_path / "figure_8"
-    files = _films.film_run(path, out, 2, size=40, title="Towers")
+    files = _films.film_run(path, out, 2, size=40, title="Towers", with_pages=True)
     assert [file.name for file in files[:2]] == ["figure_8.png", "figure_8.csv"]
     with files[1].open() as file:
         rows = list(csv.DictReader(file))
@@ -357,5 +357,7 @@ def test_films_of_towers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         num_placed = int(np.sum(last.shape_ids[2:] >= 0))
         assert int(float(row["num_placed"])) == num_placed
         assert Image.open(film).n_frames >= 1 + num_placed
+        page = film.with_suffix(".html").read_text(encoding="utf-8")
+        assert page == films.episode_page(short, episode.states, episode.actions)
     assert max(len(episode.actions) for episode in played) > 1
     assert len(set(heights)) == 2

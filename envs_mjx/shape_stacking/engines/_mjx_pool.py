@@ -17,6 +17,7 @@ import numpy as np
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines._hull_contacts import APART, Hull, four_corners, hull_hull
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
+from envs_mjx.shape_stacking.hulls import HullTable
 from envs_mjx.shape_stacking.shapes import shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
@@ -71,7 +72,6 @@ class Pool(NamedTuple):
 def _constants() -> dict[str, np.ndarray]:
     """What `pool` and `with_shapes` look up, per shape or per class, f32 and int32."""
     library = shape_library()
-    hulls = library.hulls
     values = {
         "label": library.class_labels,
         "s": library.s,
@@ -79,7 +79,14 @@ def _constants() -> dict[str, np.ndarray]:
         "center": library.center_of_mass,
         "inertia": library.principal_inertia,
         "axes": library.principal_quaternion,
-        "has_hull": hulls.has_hull,
+        "has_hull": library.hulls.has_hull,
+    }
+    return _in_32_bits(values) | hull_constants(library.hulls)
+
+
+def hull_constants(hulls: HullTable) -> dict[str, np.ndarray]:
+    """What `pool` looks up of the hulls, per class, f32 and int32."""
+    values = {
         "vertices": hulls.vertices,
         "face_vertices": hulls.face_vertices,
         "face_normals": hulls.face_normals,
@@ -88,6 +95,10 @@ def _constants() -> dict[str, np.ndarray]:
         "edge_directions": _edge_directions(hulls.edge_normals),
         "edge_points": np.take_along_axis(hulls.vertices, hulls.edges[:, :, :1], axis=1),
     }
+    return _in_32_bits(values)
+
+
+def _in_32_bits(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in values.items()}
 
 

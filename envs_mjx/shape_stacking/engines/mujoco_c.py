@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import threading
 
 import jax
@@ -15,6 +14,7 @@ from envs_mjx.shape_stacking.engines._limits import is_plausible
 from envs_mjx.shape_stacking.engines._mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+from jaxnew.cores import available_cores
 
 _CAPACITY = 256
 
@@ -65,7 +65,7 @@ class MujocoC:
         if num_threads < 0:
             raise ValueError(f"num_threads={num_threads} must be 0 (one per core) or more.")
         self.settle_steps = settle_steps
-        self.num_threads = num_threads or _available_cores()
+        self.num_threads = num_threads or available_cores()
         self._worlds = Worlds(_CAPACITY, self.num_threads, has_multiple_contacts)
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
@@ -135,9 +135,3 @@ class MujocoC:
         ok = np.zeros(len(ids), bool)
         ok[sound] = True
         return ok
-
-
-def _available_cores() -> int:
-    if hasattr(os, "sched_getaffinity"):  # Not on macOS.
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
