@@ -118,7 +118,11 @@ def machinery_of(
         env = task.make_environment()
         params = env.default_params
         normalizes = rollout.normalize_observations
-        evaluator = Evaluator(env, params, method, *sizes, normalizes, width=task.evaluation_width)
+        width = task.evaluation_width
+        if jax.default_backend() != "cpu":
+            # Many episodes take an accelerator as long as few.
+            width = max(width, rollout.num_envs)
+        evaluator = Evaluator(env, params, method, *sizes, normalizes, width=width)
         return DeviceMachinery(
             Learner(DeviceRollout(env, params, method, rollout), config), evaluator
         )

@@ -352,7 +352,8 @@ class Task:
       host: the environments on the host.
       selection_metric: episode metric that checkpoints are selected by, on validation sets.
       evaluation_width: episodes that evaluations play at a time inside jit; the last of these
-        batches may play more than were asked for, so it is small where steps are dear.
+        batches may play more than were asked for, so it is small where steps are dear. On
+        accelerators at least as many as training has environments.
       validation_groups: by split, `universe -> label int[A] of every action`: while training,
         the validation sets of such a split are drawn from half of the groups (spec method 2.2).
         Evaluations after training, and splits that are not named, know no groups.

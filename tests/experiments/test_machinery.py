@@ -1,0 +1,34 @@
+"""What tasks are trained and evaluated with."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import jax
+import pytest
+
+from experiments._flags import load_task
+from experiments._machinery import machinery_of
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("name", "budget", "on_cpu", "on_gpu"),
+    [
+        ("shape_stacking", "accelerator", 16, 1024),
+        ("shape_stacking", "laptop", 16, 32),
+        ("grid_world", "laptop", 128, 128),
+    ],
+)
+def test_accelerators_evaluate_as_wide_as_they_train(
+    monkeypatch: pytest.MonkeyPatch, name: str, budget: str, on_cpu: int, on_gpu: int
+) -> None:
+    task, nobody_asks_it = load_task(name), object()
+    config = task.stage_two[budget].ppo
+    environment = task.make_environment()
+    task = replace(task, make_environment=lambda: environment)
+    for backend, width in (("cpu", on_cpu), ("gpu", on_gpu)):
+        monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
+        method: Any = nobody_asks_it
+        assert machinery_of(task, method, config, 0, 0).evaluator.width == width
