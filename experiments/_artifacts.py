@@ -147,6 +147,11 @@ def collect_observations(
     )
 
 
+def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:
+    """int32[n] the actions of a part of the split, and those that are in every set."""
+    return np.union1d(split.ids(part), split.always_available)
+
+
 def train_representation(
     domain: Domain,
     runs: Path,
@@ -178,6 +183,9 @@ def train_representation(
         play,
         budget.stores_drawn if stores_drawn is None else stores_drawn,
     )
+    train_on = "all" if name.endswith(_ORACLE) else "train"
+    num_actions = len(_with_always_available(domain.split, train_on))
+    num_default = len(_with_always_available(Domain.of(domain.task, None).split, "train"))
     config = config_lib.set_paths(
         EmbedConfig(
             task=domain.task.actions_name or domain.task.reference,
@@ -186,8 +194,8 @@ def train_representation(
             split_hash=domain.split.hash,
             observations_hash=recordings.hash,
             seed=seed,
-            train_on="all" if name.endswith(_ORACLE) else "train",
-            model=budget.configs[kind],
+            train_on=train_on,
+            model=budget.config(kind, num_actions, num_default),
         ),
         assignments or [],
     )
@@ -197,7 +205,7 @@ def train_representation(
         path, config_lib.to_dict(config), overwrite, {"split_hash": domain.split.hash}
     ) as run:
         learner = RepresentationLearner(config.model, modality)
-        trained = np.union1d(domain.split.ids(config.train_on), domain.split.always_available)
+        trained = _with_always_available(domain.split, config.train_on)
         data = recordings.for_training(trained)
         if not (path / TABLE_FILE).exists():
             print(f"Training {name} ({config.model.num_steps} steps; {budget.cost}) in {path}.")

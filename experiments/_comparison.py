@@ -11,7 +11,7 @@ import numpy as np
 
 from experiments._curves import mean_curve
 from experiments._drawing import CURVE_SPLITS, run_curves
-from experiments._paper import paper_curve
+from experiments._paper import is_comparable, paper_curve
 from experiments._plots import Metric
 from experiments._runs import Group
 
@@ -32,7 +32,8 @@ class CurvePoint:
       paper_mean, paper_std: of the paper's curve, linear between its points; None before its first
         one or without a curve.
       verdict: `on` where the two means differ by at most the root of the summed variances, else
-        `above` or `below` (ours against the paper's); None without a paper's value.
+        `above` or `below` (ours against the paper's); None without a paper's value, or with one
+        that nothing can be compared with.
     """
 
     setting: str
@@ -58,19 +59,24 @@ def compare_curves(groups: Sequence[Group]) -> list[CurvePoint]:
             for share in _SHARES:
                 index = int(np.argmin(np.abs(steps - share * steps[-1])))
                 paper = _paper_at(group, split, steps[index])
+                ours = float(mean[index]), float(std[index])
                 points.append(
                     CurvePoint(
                         group.label,
                         split,
                         float(steps[index]),
-                        float(mean[index]),
-                        float(std[index]),
+                        *ours,
                         len(runs),
                         *paper,
-                        verdict_of(float(mean[index]), float(std[index]), *paper),
+                        verdict_of(*ours, *paper) if is_fair(group, split) else None,
                     )
                 )
     return points
+
+
+def is_fair(group: Group, split: str) -> bool:
+    """Whether the paper's curve on this part of the split can be compared with ours."""
+    return is_comparable(group.paper_environment, group.paper_method, split)
 
 
 def _paper_at(group: Group, split: str, steps: float) -> tuple[float | None, float | None]:
@@ -103,8 +109,10 @@ def comparison_csv(points: Sequence[CurvePoint]) -> str:
     return text.getvalue()
 
 
-def comparison_markdown(title: str, points: Sequence[CurvePoint], metric: Metric) -> str:
-    """The points for reading."""
+def comparison_markdown(
+    title: str, points: Sequence[CurvePoint], metric: Metric, note: str = ""
+) -> str:
+    """The points for reading, and a note below them."""
     lines = [f"# {title}", "", "| setting | sets | steps (million) | ours | paper | ours is |"]
     lines.append("|" + " --- |" * 6)
     for point in points:
@@ -120,4 +128,5 @@ def comparison_markdown(title: str, points: Sequence[CurvePoint], metric: Metric
         "curves; ± is the population standard deviation over seeds. `on`: the means differ by at "
         "most the root of the summed squares of the two deviations.",
     ]
+    lines += ["", note] if note else []
     return "\n".join(lines) + "\n"

@@ -208,6 +208,10 @@ FIGURES: dict[str, PaperFigure] = {
             _STACKING: _cells(_ALL, "hvae", "vae"),
             **_each(_CREATE, _cells(_ALL, "hvae", "vae")),
         },
+        notes={
+            _STACKING: "The paper's train curves of methods with one fixed set come from another "
+            "simulator, which rebuilds the scene at each drop; ours are not compared with them."
+        },
     ),
 }
 _SAME = {"10": "19", "19": "10"}  # The same curves: figure 10 has those of CREATE Push.

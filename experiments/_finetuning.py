@@ -14,7 +14,7 @@ from experiments import _plots as plots
 from experiments._curves import RunCurve, reference_curves
 from experiments._evaluation import evaluate_run
 from experiments._jobs import Job, duration, training_seconds
-from experiments._methods import adapted, trained_ids
+from experiments._methods import trained_ids
 from experiments._paper import paper_value
 from experiments._plots import Color, Metric
 from experiments._production import Source
@@ -60,11 +60,8 @@ class FinetuneCurves:
 
 def finetune_budget(source: Source, method: str, steps: float) -> StageTwoBudget:
     """What fine-tuning of a pretrained method spends; `steps=0` for the preset's share."""
-    task = source.domain.task
-    budget = adapted(
-        source.domain.task.stage_two[source.budget], VARIANTS[method][0], task, source.domain.split
-    )
-    updates = budget.num_updates * task.baselines.finetune_share
+    budget = replace(source, steps=0).budget_of(VARIANTS[method][0])
+    updates = budget.num_updates * source.domain.task.baselines.finetune_share
     if steps:
         updates = steps / budget.ppo.steps_per_update
     return replace(budget, num_updates=max(1, math.ceil(updates)))
@@ -80,6 +77,7 @@ def finetune_job(
         f"--run={path}",
         f"--budget={source.budget}",
         f"--seed={seed}",
+        *(f"--set={text}" for text in source.budget_assignments),
         f"--set=num_updates={budget.num_updates}",
         f"--workdir={finetune_folder(path, budget, kind)}",
         *(["--scratch"] if kind == "scratch" else []),

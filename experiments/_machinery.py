@@ -24,6 +24,9 @@ from jaxnew.rollout.normalization import RunningStatistics
 from jaxnew.sampling import ActionPool
 from jaxnew.task import HostDomain, Task
 
+# Folded into the key of a run where updates fold in their number, which is never as high.
+_RESTART = 2**31 - 1
+
 
 @dataclass(frozen=True)
 class DeviceMachinery:
@@ -46,7 +49,7 @@ class DeviceMachinery:
         self, state: TrainState, pool: ActionPool, statistics: RunningStatistics
     ) -> TrainState:
         """`state` with fresh environments that go on with observation statistics of another run."""
-        key = jax.random.fold_in(state.key, 0)
+        key = jax.random.fold_in(state.key, _RESTART)
         rollout = jax.jit(self.learner.rollout.init)(key, pool, statistics)
         return replace(state, rollout=rollout)
 
@@ -144,6 +147,14 @@ def pool_assignments(assignments: Sequence[str]) -> tuple[list[str], list[str]]:
     The others say what a run is and belong to its config.
     """
     return in_group(assignments, "pool")
+
+
+def environment_settings(assignments: Sequence[str]) -> tuple[str, ...]:
+    """Those of the form `environment.FIELD=value` as configs keep them; of a field, the last."""
+    mine, _ = in_group(assignments, "environment")
+    settings = [text.partition("=") for text in mine]
+    by_path = {path.strip(): equals + value.strip() for path, equals, value in settings}
+    return tuple(sorted(map("".join, by_path.items())))
 
 
 def with_pool_settings(task: Task, assignments: Sequence[str]) -> Task:

@@ -55,6 +55,8 @@ _ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"
 _SPLIT_FIGURES = {"full": ("fig7a_create_full_split", "")}
 _SPLIT_FIGURES_OF = {("Shape Stacking", "full"): ("fig23_stacking_variants", "full_split")}
 # Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
+# Methods whose train curves come from another simulator (experiments spec 15).
+_OTHER_SIMULATOR = {"Shape Stacking": ("nearest_neighbor", "ours_no_subsampling")}
 _SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
 
@@ -225,6 +227,11 @@ def paper_curve(environment: str, method: str, split: str) -> PaperCurve | None:
         return None
     is_within = curve.steps <= paper_steps(environment)
     return PaperCurve(*(values[is_within] for values in curve))
+
+
+def is_comparable(environment: str | None, method: str | None, split: str) -> bool:
+    """Whether what the paper shows on a part of the split was made by the environment itself."""
+    return split != "train" or method not in _OTHER_SIMULATOR.get(environment or "", ())
 
 
 def _splits() -> list[str]:

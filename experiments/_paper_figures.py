@@ -212,6 +212,7 @@ def draw(
     groups = [group_of(source, cell) for source, cell in settings]
     title = f"Figure {number}, {environment_of(groups)}: {figure.title}"
     first, _ = settings[0]
+    note = figure.notes.get(first.domain.task.name, figure.note)
     if figure.kind == "films":
         (run,) = groups[0].runs
         return films_of(run.path, out / name, title, first.workers, values)
@@ -223,14 +224,13 @@ def draw(
         curves = make_finetuned(first, groups, values.finetune_steps, values.episodes)
         return plots.save(finetune_figure(curves, title), out / f"{name}.png", values.pdf)
     if figure.kind == "curves":
-        return draw_curves(name, title, groups, out, values.pdf)
+        return draw_curves(name, title, groups, out, values.pdf, note)
     for group in groups:
         evaluate_missing(group, values.episodes, first.workers)
     groups = [group_of(source, cell) for source, cell in settings]
     rows = {g.label: [r for r in result_rows(g) if r.is_standard] for g in groups}
     drawn = bars_figure(groups, rows, title)
     files = plots.save(drawn, out / f"{name}.png", values.pdf) if drawn else []
-    note = figure.notes.get(first.domain.task.name, figure.note)
     notes = [*([note] if note else []), *notes_of(groups)]
     return files + write_results(name, title, groups, rows, out, notes)
 
@@ -247,12 +247,12 @@ def representation_panels(
 
 
 def draw_curves(
-    name: str, title: str, groups: Sequence[Group], out: Path, pdf: bool = False
+    name: str, title: str, groups: Sequence[Group], out: Path, pdf: bool = False, note: str = ""
 ) -> list[Path]:
     """Learning curves, and tables of where they stand beside the paper's."""
     comparison = compare_curves(groups)
     (out / f"{name}.csv").write_text(comparison_csv(comparison), encoding="utf-8")
-    text = comparison_markdown(title, comparison, groups[0].metric)
+    text = comparison_markdown(title, comparison, groups[0].metric, note)
     (out / f"{name}.md").write_text(text, encoding="utf-8")
     drawn = curves_figure(groups, title)
     files = plots.save(drawn, out / f"{name}.png", pdf) if drawn else []

@@ -11,6 +11,7 @@ from typing import Any
 
 from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
 from experiments._flags import UsageError, budget_of, load_task
+from experiments._machinery import environment_settings, in_group, pool_assignments
 from experiments._methods import adapted
 from experiments._runs import Run, read_runs
 from jaxnew import config as config_lib
@@ -104,11 +105,17 @@ class Source:
         task = self.domain.task
         budget = budget_of(task.stage_two, self.budget, "Stage two")
         budget = adapted(budget, method, task, self.domain.split)
-        budget = config_lib.set_paths(budget, list(self.assignments))
+        budget = config_lib.set_paths(budget, self.budget_assignments)
         if self.steps:
             updates = math.ceil(self.steps / budget.ppo.steps_per_update)
             budget = replace(budget, num_updates=updates)
         return budget
+
+    @property
+    def budget_assignments(self) -> list[str]:
+        """Those that are not about environments or pools."""
+        _, others = in_group(self.assignments, "environment")
+        return pool_assignments(others)[1]
 
     def table_of(self, representation: str) -> RepresentationTable | None:
         """The table that was given for a representation; None if none was."""
@@ -134,6 +141,7 @@ def find(source: Source, cell: Cell) -> dict[int, Run]:
       UsageError: two runs of one seed fit, so that it is not clear which one is meant.
     """
     wanted = _plain(source.budget_of(cell.method))
+    environment = environment_settings(source.assignments)
     table = source.table_of(cell.representation)
     found: dict[int, Run] = {}
     for run in policies(source.domain.folder(source.folder)):
@@ -146,6 +154,7 @@ def find(source: Source, cell: Cell) -> dict[int, Run]:
             and config["split_hash"] == source.domain.split.hash
             and run.representation == cell.representation
             and _plain(config) == wanted
+            and tuple(config.get("environment", ())) == environment
             and config["seed"] in source.seeds
             and (table is None or config["table_hash"] == table.hash)
             and run.is_finished

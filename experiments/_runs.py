@@ -143,7 +143,8 @@ class Group:
     @property
     def is_ours_alone(self) -> bool:
         """Trained in a way that the paper has no bars of."""
-        return self.is_finetuned or bool(self.config.get("num_clusters", 0))
+        options = ("num_clusters", "environment")
+        return self.is_finetuned or any(self.config.get(option) for option in options)
 
     @property
     def is_default_split(self) -> bool:

@@ -18,6 +18,7 @@ from experiments._flags import budget_of, load_task
 from experiments._machinery import (
     DeviceMachinery,
     HostMachinery,
+    environment_settings,
     in_group,
     machinery_of,
     with_environment_settings,
@@ -82,10 +83,8 @@ class TrainConfig:
           ConfigError: see `config.set_paths`.
         """
         environment, others = in_group(assignments, "environment")
-        settings = [text.partition("=") for text in (*self.environment, *environment)]
-        by_path = {path.strip(): equals + value.strip() for path, equals, value in settings}
         changed = config_lib.set_paths(self, others)
-        return replace(changed, environment=tuple(sorted(map("".join, by_path.items()))))
+        return replace(changed, environment=environment_settings([*self.environment, *environment]))
 
     @classmethod
     def of(

@@ -1,4 +1,4 @@
-"""Goes on learning with the test actions, or learns them from scratch (paper figure 7b, spec 9).
+"""Goes on learning with the test actions, or learns them from scratch (figures 10 and 19).
 
     python -m experiments.finetune --run=RUN
     python -m experiments.finetune --run=RUN --scratch

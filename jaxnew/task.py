@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, NamedTuple, Protocol
 
@@ -77,6 +77,8 @@ class StageOneBudget:
       cost: what it takes; shown before it starts.
       stores_drawn: recordings of a play with a drawing are drawn once and stored; else they are
         drawn for each batch. The numbers are the same.
+      counts_epochs: the steps are those of the default split, and encoders that are trained on
+        more or fewer actions take as many passes over them, not as many steps (spec method 3).
     """
 
     num_recordings: int
@@ -85,6 +87,21 @@ class StageOneBudget:
     checkpoint_every: int
     cost: str
     stores_drawn: bool = False
+    counts_epochs: bool = False
+
+    def config(self, kind: str, num_actions: int, num_default: int) -> RepresentationConfig:
+        """The hyper-parameters of an encoder.
+
+        Args:
+          kind: of `configs`.
+          num_actions: that it is trained on.
+          num_default: that those of the default split are trained on.
+        """
+        config = self.configs[kind]
+        if not self.counts_epochs:
+            return config
+        per_pass, usually = (n // config.actions_per_batch for n in (num_actions, num_default))
+        return replace(config, num_steps=config.num_steps * per_pass // usually)
 
 
 @dataclass(frozen=True)

@@ -150,8 +150,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         return self.start_from(rules.start(cylinder, center, gap))
 
     def start_from(self, bodies: Bodies) -> tuple[jax.Array, StackingState]:
-        """Starts an episode from a scene of one's own, such as one of `rules.start`."""
-        # Only cylinders are there, which are far faster to draw alone.
+        """Starts an episode from two start cylinders and nothing else, as of `rules.start`."""
+        # Two bodies are far faster to draw than all.
         picture = self.picture(bodies, scene.NUM_START_CYLINDERS)
         frames = jnp.zeros((FRAME_SIZE, FRAME_SIZE, STACK_SIZE), jnp.uint8)
         frames = frames.at[:, :, -1].set(picture)

@@ -32,7 +32,8 @@ def viewpoints(
       seed: of the views.
       num_recordings: S.
       num_distinct_views: views before they repeat; 32 mimics the original's files, which hold 1024
-        pictures of 32 views.
+        pictures of 32 views. No command has it; a task of one's own gives its `Play`
+        `partial(record_block, num_distinct_views=32)`.
 
     Returns:
       f32[S] azimuth, rad, and f32[S] height, m.

@@ -159,7 +159,10 @@ _STAGE_ONE = {
         2000,
         "6 minutes on two cores, one of them for recording",
     ),
-    "paper": _stage_one(1024, STATE_HVAE, 10_000, "4 days on two cores, from the rate of `laptop`"),
+    "paper": replace(
+        _stage_one(1024, STATE_HVAE, 10_000, "4 days on two cores, from the rate of `laptop`"),
+        counts_epochs=True,
+    ),
 }
 
 

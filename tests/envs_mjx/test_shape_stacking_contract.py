@@ -98,17 +98,18 @@ def test_old_frames_are_zero_after_resets_and_then_move_up(rollout) -> None:
 def test_info_adds_up(rollout) -> None:
     """Counts and the largest height accumulate within an episode and start anew after it."""
     assert set(ENV.episode_metrics) | {"invalid_action"} == set(rollout.info)
-    length, placed = np.zeros(NUM_ENVS, int), np.zeros(NUM_ENVS, int)
+    length, placed, repeats = (np.zeros(NUM_ENVS, int) for _ in range(3))
     highest = rollout.state.max_height[0]
     for t, done in enumerate(rollout.done):
         info = {name: values[t] for name, values in rollout.info.items()}
         length += 1
-        placed += ~rollout.action.stop[t] & (info["num_repeats"] == 0)
+        placed += ~rollout.action.stop[t] & (info["num_repeats"] == repeats)
         highest = np.maximum(highest, info["final_height"])
         np.testing.assert_array_equal(info["episode_length"], length)
         np.testing.assert_array_equal(info["num_placed"], placed)
         np.testing.assert_array_equal(info["max_height"], highest)
         np.testing.assert_array_equal(info["is_stopped"], rollout.action.stop[t])
+        repeats = np.where(done, 0, info["num_repeats"])
         length[done], placed[done] = 0, 0
         if t + 1 < NUM_STEPS:
             # The new start's highest origin is that of a cylinder: its s above the table.

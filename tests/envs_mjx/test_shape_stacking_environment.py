@@ -73,9 +73,21 @@ def test_a_shape_is_placed_once() -> None:
     assert (later["num_placed"], later["episode_length"]) == (1, 2)
     np.testing.assert_array_equal(again.bodies.shape_ids, state.bodies.shape_ids)
     np.testing.assert_allclose(again.bodies.qpos, state.bodies.qpos, atol=1e-3)
+    again, *_, later = act(REAL, again, 690, 0.3)
+    assert (later["num_repeats"], later["num_placed"], later["episode_length"]) == (2, 1, 3)
     _, reward, *_, last = act(REAL, again, 0, 0.0, stop=True)
     assert reward == pytest.approx(0.732, abs=0.005)
     assert last["max_height"] == pytest.approx(0.982, abs=0.005)
+
+
+def test_only_a_new_shape_stops_the_others() -> None:
+    """Spec 4: repeated shapes and stops leave velocities as they are."""
+    state, *_ = act(STILL, started(STILL), 690, -0.65)
+    moving = state.bodies.replace(qvel=jnp.ones_like(state.bodies.qvel))
+    state = state.replace(bodies=moving)
+    for shape_id, stops, speed in ((690, False, 1.0), (7, True, 1.0), (7, False, 0.0)):
+        after, *_ = act(STILL, state, shape_id, 0.0, stop=stops)
+        np.testing.assert_array_equal(after.bodies.qvel, speed)
 
 
 def test_a_start_cylinder_is_no_placed_shape() -> None:

@@ -9,18 +9,16 @@ from __future__ import annotations
 import time
 from pathlib import Path
 
-import jax
 import numpy as np
 import pytest
 
-from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_library, shape_universe
+from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
 from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
 from experiments._artifacts import REPRESENTATION_SEED
 from experiments._training import load_trainer
 from jaxnew import metrics
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.sampling import draw_sets
 from tests.experiments import stacking_runs as stacking
 from tests.experiments.commands import read_json
 from tests.experiments.create_runs import parameters, saved, timeless
@@ -214,26 +212,6 @@ def test_new_pictures_are_encoded_and_acted_with(
     result = evaluation(runs / "line", "table-new_table")
     assert (result["num_actions"], result["num_episodes"]) == (8, EPISODES)
     check_heights({name: row["mean"] for name, row in result["metrics"].items()})
-
-
-def test_full_split_watches_halves_of_its_classes(
-    runs: Path, trained_alike: dict[str, str]
-) -> None:
-    """Spec method 2.2: of the validation shapes, and of them only."""
-    assert trained_alike
-    _, trainer, split = load_trainer(runs / "full")
-    labels = shape_library().class_labels
-    keys = jax.random.split(jax.random.key(0), 200)
-    _, pool = trainer.watched("validation")
-    ids = np.asarray(draw_sets(keys, pool, 5).ids)
-    assert np.isin(ids, split.validation).all()
-    assert not {*labels[split.validation]} & {*labels[split.train]}
-    num_classes = [len({*labels[row]}) for row in ids]
-    assert max(num_classes) == 4, "of eight"
-    _, everything = trainer.on_split("validation", trainer.evaluator)
-    ids = np.asarray(draw_sets(keys, everything, 5).ids)
-    assert max(len({*labels[row]}) for row in ids) == 5
-    assert trainer.watched("train")[1].group_starts is None
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -16,7 +17,7 @@ from envs_mjx.shape_stacking import ShapeStacking, films
 from envs_mjx.shape_stacking.camera import task_camera
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments import _drawing, _films, _finetuning, _paper_figures, figures
+from experiments import _comparison, _drawing, _films, _finetuning, _paper_figures, figures
 from experiments._episode import is_success
 from experiments._figure_list import FIGURES, number_of
 from experiments._flags import load_task
@@ -153,6 +154,31 @@ def test_every_curve_of_figure_24_is_the_papers(tmp_path: Path) -> None:
         assert set(curves) == {"train", "validation"}
 
 
+@pytest.mark.unit
+def test_figures_find_runs_of_their_own_environment_only(tmp_path: Path) -> None:
+    """A run with other settings is another setting, which the paper has no numbers of."""
+    kept, curve = "environment.reward_variant=paper", {"curve": (0.1,), "metric": HEIGHT}
+    settings = {"plain": [], "changed": [kept]}
+    plain = source_of(TASK, tmp_path)
+    changed = replace(plain, assignments=(" environment.reward_variant = paper",))
+    for name, environment in settings.items():
+        config = {**config_of(plain, OURS), "environment": environment}
+        write_run(tmp_path / TASK / name, config, **curve)
+    for source, name in ((plain, "plain"), (changed, "changed")):
+        (run,) = find(source, OURS).values()
+        assert run.path == tmp_path / TASK / name
+        group = Group("ours", source.domain.task, (run,))
+        assert group.paper_method == {"plain": "ours", "changed": None}[name]
+    source = replace(plain, assignments=(kept, "pool.max_restarts=3", "num_updates=7"))
+    assert source.budget_of("ours").num_updates == 7
+    assert source.budget_assignments == ["num_updates=7"]
+    job = _finetuning.finetune_job(source, tmp_path, "ours", 1, "warm", 0)
+    assert [word for word in job.command if word.startswith("--set")] == [
+        "--set=num_updates=7",
+        f"--set=num_updates={math.ceil(7 * source.domain.task.baselines.finetune_share)}",
+    ]
+
+
 @pytest.mark.golden
 def test_learning_curves_stand_beside_the_papers(tmp_path: Path) -> None:
     """Experiments spec 15, ours at a third, two thirds and all of the budget."""
@@ -174,6 +200,23 @@ def test_learning_curves_stand_beside_the_papers(tmp_path: Path) -> None:
     curve = paper_curve("Shape Stacking", "ours", "train")
     assert curve.mean[-1] == pytest.approx(2.538, abs=0.005)
     assert 2.7e6 < curve.steps[-1] <= 3e6
+
+
+@pytest.mark.unit
+def test_train_curves_of_another_simulator_are_not_compared(tmp_path: Path) -> None:
+    """Experiments spec 15: of methods with one fixed set; their validation curves are sound."""
+    source = source_of(TASK, tmp_path, budget="paper")
+    cells = (OURS, Cell("nearest-neighbour", "hvae"), Cell("no-subsampling", "hvae"))
+    groups = [group_of(source, cell, curve=(1.5, 2.4, 2.1), updates=244) for cell in cells]
+    for group in groups:
+        points = [p for p in _comparison.compare_curves([group]) if p.paper_mean is not None]
+        assert {p.split for p in points} == {"train", "validation"}
+        for point in points:
+            is_fair = group is groups[0] or point.split == "validation"
+            assert (point.verdict is not None) == is_fair
+    note = FIGURES["24"].notes[TASK]
+    _, text, _ = _paper_figures.draw_curves("f", "Curves", groups, tmp_path, note=note)
+    assert text.read_text().rstrip().endswith(note)
 
 
 @pytest.mark.unit

@@ -1,4 +1,4 @@
-"""MuJoCo's C engine: on the host, in threads, each world with its own exact shapes."""
+"""MuJoCo's C engine: on the host, in threads, each world with its own shapes."""
 
 from __future__ import annotations
 
