@@ -18,9 +18,10 @@ from envs_mjx.shape_stacking.engines._mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 
-# Line searches always take all their steps here. With 8 and 12 no tower ends otherwise; with fewer
-# contacts some do: results/shape_stacking/mjx_speed.md.
-SOLVER = scene.Solver(iterations=5, ls_iterations=5)
+# Line searches always take all their steps here. With 8 and 12 towers end no nearer to C's; with 2
+# and 3 a cube that tips off an edge ends 5 cm from where it should (spec 13, check 14):
+# results/shape_stacking/mjx_speed.md.
+SOLVER = scene.Solver(iterations=3, ls_iterations=5)
 MAX_CONTACTS = 48
 
 
