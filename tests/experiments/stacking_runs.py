@@ -12,7 +12,7 @@ import numpy as np
 from envs_mjx.shape_stacking import published_split
 from jaxnew import metrics
 from jaxnew.actions import ActionSplit
-from tests.experiments import several
+from tests.experiments import commands
 from tests.experiments.commands import read_json
 from tests.experiments.several import run_several
 from tests.experiments.stacking_probes import EPISODES
@@ -21,8 +21,8 @@ WIDTH = 21  # Of every representation, so that policies share their programs.
 WATCHED = "tests.experiments.stacking_probes:watched"
 # Without its newer emitters XLA compiles the ray caster in a third of the time.
 ENVIRONMENT = {
-    **several.ENVIRONMENT,
-    "XLA_FLAGS": f"{several.ENVIRONMENT['XLA_FLAGS']} --xla_cpu_use_fusion_emitters=false",
+    **commands.ENVIRONMENT,
+    "XLA_FLAGS": f"{commands.ENVIRONMENT['XLA_FLAGS']} --xla_cpu_use_fusion_emitters=false",
 }
 EMBED = "shape_stacking/embed-{}-default-smoke-31"
 SHORT = ("--set=num_updates=1",)

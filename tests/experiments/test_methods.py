@@ -12,41 +12,57 @@ from experiments._flags import UsageError, load_task
 from experiments._methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew import metrics
 from tests.experiments.commands import read_json, run
+from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
 
 
+# (task, method, representation) -> sizes of the sets that train and test episodes offer.
+SIZES = {
+    ("grid_world", "continuous", "gt12"): (50, 50),
+    ("grid_world", "no-subsampling", "gt12"): (512, 50),
+    ("grid_world", "no-entropy", "random-3"): (50, 50),
+    ("recommender", "ours", "product"): (50, 50),
+    ("recommender", "nearest-neighbour", "product-mu"): (5000, 50),
+}
+SOURCES = ("ours", "nearest-neighbour")
+FOLDER = "{1}-{2}-default-smoke-31"
+# A fixed set of 5,000 in every minibatch of every epoch takes long, and is the same in each.
+SHORT = ("--set=num_updates=1", "--set=ppo.num_epochs=1", "--set=loop.evaluation_episodes=8")
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("runs")
+    """The folder of a run for each of `SIZES`, and of two for fine-tuning."""
+    folder = tmp_path_factory.mktemp("runs")
+    jobs = []
+    for task, method, representation in (
+        *SIZES,
+        *[("grid_world", method, "gt12") for method in SOURCES],
+    ):
+        flags = (f"--method={method}", f"--representation={representation}")
+        jobs.append((f"--task={task}", *flags, "--budget=smoke", f"--runs={folder}", *SHORT))
+    run_several("train", jobs)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def evaluated(runs: Path) -> Path:
+    """The same, each of `SIZES` evaluated in another process."""
+    flags = ("--sets=train,test", "--episodes=32")
+    paths = [runs / run[0] / FOLDER.format(*run) for run in SIZES]
+    run_several("evaluate", [(f"--run={path}", *flags) for path in paths])
+    return runs
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize(
-    ("task", "representation", "method", "sizes"),
-    [
-        ("grid_world", "gt12", "continuous", (50, 50)),
-        ("grid_world", "gt12", "no-subsampling", (512, 50)),
-        ("grid_world", "random-3", "no-entropy", (50, 50)),
-        ("recommender", "product", "ours", (50, 50)),
-        ("recommender", "product-mu", "nearest-neighbour", (5000, 50)),
-    ],
-)
-def test_methods_train_and_are_evaluated(
-    runs: Path, task: str, representation: str, method: str, sizes: tuple[int, int]
-) -> None:
-    run(
-        "train",
-        f"--task={task}",
-        f"--method={method}",
-        f"--representation={representation}",
-        "--budget=smoke",
-        f"--runs={runs}",
-    )
-    path = runs / task / f"{method}-{representation}-default-smoke-31"
-    run("evaluate", f"--run={path}", "--sets=train,test", "--episodes=32")
-    for name, size in zip(("train", "test"), sizes, strict=True):
-        result = read_json(path / "evaluation" / f"{name}-best-sampled-m{size}.json")
+@pytest.mark.parametrize("name", SIZES, ids="-".join)
+def test_methods_train_and_are_evaluated(evaluated: Path, name: tuple[str, str, str]) -> None:
+    path = evaluated / name[0] / FOLDER.format(*name)
+    config = read_json(path / "config.json")
+    assert (config["task"], config["method"], config["representation"]) == name
+    for part, size in zip(("train", "test"), SIZES[name], strict=True):
+        result = read_json(path / "evaluation" / f"{part}-best-sampled-m{size}.json")
         assert result["set_size"] == size
         assert result["num_episodes"] == 32
 
@@ -54,15 +70,16 @@ def test_methods_train_and_are_evaluated(
 @pytest.mark.integration
 def test_a_policy_goes_on_with_new_actions(runs: Path) -> None:
     """Both kinds of policy, warm and from scratch; the discrete head is as large as its set."""
-    for method in ("ours", "nearest-neighbour"):
-        flags = ["--representation=gt12", "--budget=smoke", f"--method={method}"]
-        run("train", *flags, f"--runs={runs}")
-        path = runs / "grid_world" / f"{method}-gt12-default-smoke-31"
-        for start, flag in (("warm", []), ("scratch", ["--scratch"])):
-            run("finetune", f"--run={path}", "--budget=smoke", *flag)
-            folder = path / f"finetune-{start}-smoke-31"
-            assert read_json(folder / "config.json")["trained_on"] == "test"
-            assert metrics.read(folder)[-1]["step"] == 1
+    jobs, folders = [], []
+    for method in SOURCES:
+        path = runs / "grid_world" / FOLDER.format("", method, "gt12")
+        for start, flags in (("warm", ()), ("scratch", ("--scratch",))):
+            jobs.append((f"--run={path}", "--budget=smoke", *flags))
+            folders.append(path / f"finetune-{start}-smoke-31")
+    run_several("finetune", jobs)
+    for folder in folders:
+        assert read_json(folder / "config.json")["trained_on"] == "test"
+        assert metrics.read(folder)[-1]["step"] == 1
     assert "cannot be fine-tuned" in run("finetune", f"--run={folder}", fails=True)
 
 
