@@ -14,9 +14,12 @@ ROOT = Path(__file__).resolve().parents[2]
 # Programs that are compiled fast rather than fast programs, and all of them kept on disk. Runs
 # whose bits are compared have to be of one kind.
 ENVIRONMENT = {
-    "XLA_FLAGS": "--xla_backend_optimization_level=0",
+    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
 }
+# For runs that compute a lot.
+OPTIMIZED = {"XLA_FLAGS": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
 
 
 def run(
