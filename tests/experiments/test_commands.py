@@ -165,7 +165,9 @@ def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path
     """Of a run that is complete, and of two that are made; for `hvae` see below."""
     common = ("--budget=smoke", f"--runs={runs}")
     names = ("hvae-relative", "hvae-onehot", "vae")
-    outputs = run_several("embed", [(*common, f"--representation={name}") for name in names])
+    jobs = [(*common, f"--representation={name}") for name in names]
+    jobs[-1] = (*jobs[-1], "--set=model.actions_per_batch=16")
+    outputs = run_several("embed", jobs)
     assert "already complete" in outputs[0]
     numbers = read_json(encoder_run / "evaluation" / "representation.json")
     assert 0.0 <= numbers["purity_held_out"] <= 1.0
@@ -223,8 +225,10 @@ def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:
         "--budget=smoke",
         "--representation=gt12",
         f"--runs={runs}",
-        "--set=num_updates=120",
+        "--set=num_updates=80",
+        "--set=ppo.num_epochs=1",
         "--set=ppo.lr_steps=40000",
+        "--set=loop.evaluation_episodes=8",
     )
     calm, killed = runs / "calm", runs / "killed"
     run("train", *flags, f"--workdir={calm}")
