@@ -164,7 +164,7 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
 def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path) -> None:
     """Of a run that is complete, and of two that are made; for `hvae` see below."""
     common = ("--budget=smoke", f"--runs={runs}")
-    names = ("hvae-relative", "hvae-onehot", "vae")
+    names = ("hvae-relative", "hvae-onehot-oracle", "vae")
     jobs = [(*common, f"--representation={name}") for name in names]
     jobs[-1] = (*jobs[-1], "--set=model.actions_per_batch=16")
     outputs = run_several("embed", jobs)
@@ -173,8 +173,9 @@ def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path
     assert 0.0 <= numbers["purity_held_out"] <= 1.0
     assert len(numbers["linear_r2"]["net displacement"]) == 2
     assert len(numbers["linear_r2"]["per-move coordinates"]) == 10
-    for name in names[1:]:
+    for name, part in zip(names[1:], ("all", "train"), strict=True):
         path = runs / "grid_world" / f"embed-{name}-default-smoke-31"
+        assert read_json(path / "config.json")["train_on"] == part
         assert RepresentationTable.load(path / "table.npz").vectors.shape == (1024, 16)
 
 

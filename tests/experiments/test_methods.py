@@ -24,6 +24,7 @@ SIZES = {
     ("grid_world", "continuous", "gt12"): (50, 50),
     ("grid_world", "no-subsampling", "gt12"): (512, 50),
     ("grid_world", "no-entropy", "random-12"): (50, 50),
+    ("grid_world", "random", "gt12"): (50, 50),
     ("recommender", "ours", "product"): (50, 50),
 }
 FULL = ("recommender", "nearest-neighbour", "product-mu")
