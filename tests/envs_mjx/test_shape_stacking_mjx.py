@@ -28,6 +28,7 @@ from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from experiments import _stacking as stacking
 from experiments import stacking_figures as figures
 
+pytestmark = pytest.mark.optimized
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 NUM_SLOTS, WIDTH = 5, 24
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import textwrap
@@ -41,11 +40,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def run_page(page: Path, runs: Path) -> str:
-    """Runs the page's commands in order, at smoke budget and below `runs`; their output.
-
-    Compiling takes most of the time, and nothing here depends on how well it is done.
-    """
-    environment = {**os.environ, "JAX_DISABLE_MOST_OPTIMIZATIONS": "1"}
+    """Runs the page's commands in order, at smoke budget and below `runs`; their output."""
     outputs = []
     for python, flag, module, *flags in commands(page):
         assert (python, flag) == ("python", "-m")
@@ -53,7 +48,7 @@ def run_page(page: Path, runs: Path) -> str:
         is_evaluation = module == "experiments.evaluate"
         words.append("--episodes=64" if is_evaluation else f"--runs={runs}")
         name = module.removeprefix("experiments.")
-        outputs.append(run(name, *words, environment=environment))
+        outputs.append(run(name, *words))
     return "".join(outputs)
 
 

@@ -3,23 +3,40 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 ROOT = Path(__file__).resolve().parents[2]
+# Programs that are compiled fast rather than fast programs, and all of them kept on disk. Runs
+# whose bits are compared have to be of one kind.
+ENVIRONMENT = {
+    "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
+    "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
+    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+}
+# For runs that compute a lot.
+OPTIMIZED = {"XLA_FLAGS": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
 
 
 def run(
-    *arguments: str | Path, fails: bool = False, environment: dict[str, str] | None = None
+    *arguments: str | Path, fails: bool = False, environment: Mapping[str, str] = ENVIRONMENT
 ) -> str:
-    """Output (stdout and stderr) of `python -m experiments.ARGUMENTS`; checks the exit status."""
+    """Output (stdout and stderr) of `python -m experiments.ARGUMENTS`; checks the exit status.
+
+    Args:
+      arguments: the module, and its flags.
+      fails: whether the command ends with an error, which is then told without a traceback.
+      environment: variables of the process, beside those of this one.
+    """
     module, *flags = map(str, arguments)
     done = subprocess.run(
         [sys.executable, "-m", f"experiments.{module}", *flags],
         cwd=ROOT,
-        env=environment,
+        env={**os.environ, **environment},
         capture_output=True,
         text=True,
         timeout=400,

@@ -12,18 +12,12 @@ import numpy as np
 from envs_mjx.shape_stacking import published_split
 from jaxnew import metrics
 from jaxnew.actions import ActionSplit
-from tests.experiments import several
 from tests.experiments.commands import read_json
 from tests.experiments.several import run_several
 from tests.experiments.stacking_probes import EPISODES
 
 WIDTH = 21  # Of every representation, so that policies share their programs.
 WATCHED = "tests.experiments.stacking_probes:watched"
-# Without its newer emitters XLA compiles the ray caster in a third of the time.
-ENVIRONMENT = {
-    **several.ENVIRONMENT,
-    "XLA_FLAGS": f"{several.ENVIRONMENT['XLA_FLAGS']} --xla_cpu_use_fusion_emitters=false",
-}
 EMBED = "shape_stacking/embed-{}-default-smoke-31"
 SHORT = ("--set=num_updates=1",)
 
@@ -98,14 +92,14 @@ def embed(runs: Path, names: Iterable[str], *flags: str) -> list[str]:
                 *flags,
             )
         )
-    return run_several("embed", jobs, environment=ENVIRONMENT)
+    return run_several("embed", jobs)
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
     """What `train` prints for each of `RUNS`, all in one process."""
     names = list(names)
     jobs = [RUNS[name].training(runs, runs / name) for name in names]
-    outputs = run_several("train", jobs, probe=WATCHED, environment=ENVIRONMENT)
+    outputs = run_several("train", jobs, probe=WATCHED)
     return dict(zip(names, outputs, strict=True))
 
 
@@ -114,7 +108,7 @@ def evaluate(runs: Path, names: Iterable[str], *flags: str) -> dict[str, str]:
     names = list(names)
     common = ("--sets=train,test", f"--episodes={EPISODES}", *flags)
     jobs = [(f"--run={runs / name}", *common) for name in names]
-    outputs = run_several("evaluate", jobs, probe=WATCHED, environment=ENVIRONMENT)
+    outputs = run_several("evaluate", jobs, probe=WATCHED)
     return dict(zip(names, outputs, strict=True))
 
 

@@ -28,6 +28,7 @@ from jaxnew.rollout.normalization import RunningStatistics
 from jaxnew.sampling import ActionPool
 from tests import probe_environments as probe
 from tests.experiments.commands import run
+from tests.experiments.several import run_several
 from tests.experiments.test_paper_figures import source_at
 
 
@@ -48,27 +49,28 @@ def rows_of(file: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(opened))
 
 
+STUDIED = {
+    "set-size": "10,50",
+    "unseen-ratio": "0,1",
+    "growing-set": "5,50",
+    "recordings": "16,1",
+}
+
+
 @pytest.mark.integration
 def test_sizes_ratios_growth_and_recordings(runs: Path) -> None:
+    common = (
+        f"--run={runs / POLICY}",
+        f"--encoder={runs / ENCODER}",
+        "--episodes=128",
+        f"--out={runs / 'analysis'}",
+    )
+    jobs = [(f"--study={study}", f"--values={STUDIED[study]}", *common) for study in STUDIED]
+    *first, again = run_several("analyze", [*jobs, jobs[-1]])
+    assert " done in " not in again
     found = {}
-    for study, values in (
-        ("set-size", "10,50"),
-        ("unseen-ratio", "0,1"),
-        ("growing-set", "5,50"),
-        ("recordings", "16,1"),
-    ):
-        command = (
-            "analyze",
-            f"--study={study}",
-            f"--run={runs / POLICY}",
-            f"--encoder={runs / ENCODER}",
-            f"--values={values}",
-            "--episodes=128",
-            f"--out={runs / 'analysis'}",
-        )
-        first = run(*command)
-        assert first.count(" done in ") == {"growing-set": 1}.get(study, 2)  # 50 is there already.
-        assert " done in " not in run(*command) if study == "recordings" else True
+    for study, output in zip(STUDIED, first, strict=True):
+        assert output.count(" done in ") == {"growing-set": 1}.get(study, 2)  # 50 is there already.
         name = study.replace("-", "_")
         assert (runs / "analysis" / f"{name}.png").stat().st_size > 5000
         found[study] = [float(row["mean"]) for row in rows_of(runs / "analysis" / f"{name}.csv")]

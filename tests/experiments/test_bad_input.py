@@ -16,6 +16,7 @@ from jaxnew import observations
 from jaxnew.actions import SplitMismatch
 from jaxnew.representation.table import RepresentationTable
 from tests.experiments.commands import run
+from tests.experiments.several import refused
 
 pytestmark = pytest.mark.integration
 
@@ -31,27 +32,33 @@ def policy_run(runs: Path) -> Path:
     return runs / "grid_world" / "ours-gt12-default-smoke-31"
 
 
-@pytest.mark.parametrize(
-    ("flags", "says"),
-    [
-        (["--task=gridworld"], ["gridworld", "grid_world"]),
-        (["--task=jaxnew.actions:TASK"], ["jaxnew.actions:TASK", "Task"]),
-        (["--method=our"], ["'our'", "ours"]),
-        (["--representation=gt13"], ["gt13", "gt12", "hvae"]),
-        (["--split=half"], ["half", "default"]),
-        (["--budget=papr"], ["papr", "paper"]),
-        (["--set=ppo.num_epoch=2"], ["ppo.num_epoch", "ppo.num_epochs"]),
-        (["--set=ppo.num_epochs=two"], ["ppo.num_epochs", "int", "two"]),
-        (["--set=ppo.num_minibatches=7"], ["256", "num_minibatches=7"]),
-        (["--set=ppo.rollout.set_size=300"], ["300", "validation", "256"]),
-        (["train"], ["train", "--flag=value"]),
-    ],
-)
-def test_wrong_names_and_values(runs: Path, flags: list[str], says: list[str]) -> None:
-    defaults = ["--budget=smoke", "--representation=gt12", f"--runs={runs / 'none'}"]
-    output = run("train", *defaults, *flags, fails=True)
-    last_lines = output[-700:]
-    for words in says:
+WRONG = {
+    "--task=gridworld": ["gridworld", "grid_world"],
+    "--task=jaxnew.actions:TASK": ["jaxnew.actions:TASK", "Task"],
+    "--method=our": ["'our'", "ours"],
+    "--representation=gt13": ["gt13", "gt12", "hvae"],
+    "--split=half": ["half", "default"],
+    "--budget=papr": ["papr", "paper"],
+    "--set=ppo.num_epoch=2": ["ppo.num_epoch", "ppo.num_epochs"],
+    "--set=ppo.num_epochs=two": ["ppo.num_epochs", "int", "two"],
+    "--set=ppo.num_minibatches=7": ["256", "num_minibatches=7"],
+    "--set=ppo.rollout.set_size=300": ["300", "validation", "256"],
+    "train": ["train", "--flag=value"],
+}
+
+
+@pytest.fixture(scope="module")
+def answers(runs: Path) -> dict[str, str]:
+    """What `train` says to each of `WRONG`."""
+    defaults = ("--budget=smoke", "--representation=gt12", f"--runs={runs / 'none'}")
+    outputs = refused("train", [(*defaults, flag) for flag in WRONG])
+    return dict(zip(WRONG, outputs, strict=True))
+
+
+@pytest.mark.parametrize("flag", WRONG)
+def test_wrong_names_and_values(answers: dict[str, str], flag: str) -> None:
+    last_lines = answers[flag][-700:]
+    for words in WRONG[flag]:
         assert words in last_lines
 
 
@@ -95,7 +102,8 @@ def test_tables_that_do_not_fit(policy_run: Path, runs: Path, tmp_path: Path) ->
 
 
 def test_a_user_s_own_table_trains(policy_run: Path, tmp_path: Path) -> None:
-    vectors = np.random.default_rng(0).normal(size=(1024, 3))
+    # As wide as that of `policy_run`, so that both share their programs.
+    vectors = np.random.default_rng(0).normal(size=(1024, 12))
     np.savez(tmp_path / "mine.npz", ids=np.arange(1024), vectors=vectors)
     output = run(
         "train",
@@ -126,41 +134,42 @@ def test_damaged_run_directories(policy_run: Path, tmp_path: Path) -> None:
     record = json.loads((swapped_split / "split.json").read_text())
     record["train"][0], record["test"][0] = record["test"][0], record["train"][0]
     (swapped_split / "split.json").write_text(json.dumps(record))
-    for path, words in [
-        (no_config, "config.json"),
-        (cut_config, "config.json"),
-        (no_checkpoint, "checkpoint"),
-        (cut_checkpoint, "checkpoint"),
-        (swapped_split, "split.json"),
-    ]:
-        output = run("evaluate", f"--run={path}", "--episodes=8", fails=True)
+    cases = {
+        no_config: "config.json",
+        cut_config: "config.json",
+        no_checkpoint: "checkpoint",
+        cut_checkpoint: "checkpoint",
+        swapped_split: "split.json",
+        tmp_path / "nowhere": "nowhere",
+    }
+    outputs = refused("evaluate", [(f"--run={path}", "--episodes=8") for path in cases])
+    for words, output in zip(cases.values(), outputs, strict=True):
         assert words in output[-900:]
-    assert run("evaluate", f"--run={tmp_path / 'nowhere'}", fails=True)
 
 
-@pytest.mark.parametrize(
-    ("content", "says"),
-    [
-        ("1 2 x", "x"),
-        ("", "no action id"),
-        ("1 1 2", "twice"),
-        ("5 1024", "0..1023"),
-        ("1 2 3", "3"),
-    ],
-)
-def test_bad_id_files(policy_run: Path, tmp_path: Path, content: str, says: str) -> None:
-    file = tmp_path / "ids.txt"
-    file.write_text(content)
-    output = run("evaluate", f"--run={policy_run}", f"--ids={file}", "--episodes=8", fails=True)
-    assert says in output[-500:]
+def test_bad_id_files(policy_run: Path, tmp_path: Path) -> None:
+    contents = {
+        "1 2 x": "x",
+        "": "no action id",
+        "1 1 2": "twice",
+        "5 1024": "0..1023",
+        "1 2 3": "3",
+    }
+    jobs = []
+    for number, content in enumerate(contents):
+        file = tmp_path / f"{number}.txt"
+        file.write_text(content)
+        jobs.append((f"--run={policy_run}", f"--ids={file}", "--episodes=8"))
+    for says, output in zip(contents.values(), refused("evaluate", jobs), strict=True):
+        assert says in output[-500:]
 
 
 def test_a_nan_stops_the_run_and_keeps_what_was_saved(runs: Path, tmp_path: Path) -> None:
     flags = ["--budget=smoke", "--representation=gt12", f"--workdir={tmp_path / 'nan'}"]
-    output = run("train", *flags, "--set=hyperparameters.learning_rate=1e38", fails=True)
+    job = (*flags, "--set=hyperparameters.learning_rate=1e38")
+    output, again = refused("train", [job, job])
     assert "NonFiniteError" in output
     assert "step" in output
-    again = run("train", *flags, "--set=hyperparameters.learning_rate=1e38", fails=True)
     assert "NonFiniteError" in again
 
 

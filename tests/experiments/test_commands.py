@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +20,8 @@ from experiments._flags import load_task
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
-from tests.experiments.commands import ROOT, read_json, run
+from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
+from tests.experiments.several import run_several
 
 pytestmark = pytest.mark.integration
 
@@ -61,32 +63,42 @@ def test_a_run_directory_explains_itself(hvae_run: Path, encoder_run: Path) -> N
         assert Checkpointer(hvae_run / "checkpoints").steps(kind)
 
 
-def test_evaluate_in_a_new_process_and_twice_the_same(hvae_run: Path) -> None:
-    flags = ("evaluate", f"--run={hvae_run}", "--sets=train,test", "--episodes=96")
-    output = run(*flags)
-    assert "test (96 episodes, sampled)" in output
+@pytest.fixture(scope="module")
+def evaluated(hvae_run: Path) -> tuple[str, dict[str, Any]]:
+    """What `evaluate` printed and found; then, in another process, it is run in several ways."""
+    flags = (f"--run={hvae_run}", "--sets=train,test", "--episodes=96")
+    output = run("evaluate", *flags)
     file = hvae_run / "evaluation" / "test-best-sampled-m50.json"
     first = read_json(file)
+    file.unlink()
+    ids_file = hvae_run.parent / "chosen.txt"
+    ids_file.write_text(" ".join(map(str, read_json(hvae_run / "split.json")["test"][:60])))
+    latest = next((hvae_run / "checkpoints" / "latest").iterdir())
+    of_ids = (f"--run={latest}", f"--ids={ids_file}", "--episodes=32", "--deterministic")
+    mixture = (f"--run={hvae_run}", "--unseen_ratio=0.5", "--episodes=32", "--set_size=20")
+    run_several("evaluate", [flags, of_ids, mixture])
+    return output, first
+
+
+def test_evaluate_in_a_new_process_and_twice_the_same(
+    hvae_run: Path, evaluated: tuple[str, dict[str, Any]]
+) -> None:
+    output, first = evaluated
+    assert "test (96 episodes, sampled)" in output
     assert first["num_episodes"] == 96
     assert first["num_actions"] == 256
     success = first["metrics"]["is_success"]
     assert success["low"] <= success["mean"] <= success["high"]
-    run(*flags)
-    second = read_json(file)
+    second = read_json(hvae_run / "evaluation" / "test-best-sampled-m50.json")
     assert second["metrics"] == first["metrics"]
 
 
 def test_evaluate_on_a_checkpoint_ids_a_mixture_and_greedily(
-    hvae_run: Path, tmp_path: Path
+    hvae_run: Path, evaluated: tuple[str, dict[str, Any]]
 ) -> None:
-    split = read_json(hvae_run / "split.json")
-    ids_file = tmp_path / "chosen.txt"
-    ids_file.write_text(" ".join(map(str, split["test"][:60])))
-    latest = next((hvae_run / "checkpoints" / "latest").iterdir())
-    run("evaluate", f"--run={latest}", f"--ids={ids_file}", "--episodes=32", "--deterministic")
+    assert evaluated
     found = read_json(hvae_run / "evaluation" / "ids-chosen-latest-greedy-m50.json")
     assert (found["num_actions"], found["checkpoint"]) == (60, "latest")
-    run("evaluate", f"--run={hvae_run}", "--unseen_ratio=0.5", "--episodes=32", "--set_size=20")
     found = read_json(hvae_run / "evaluation" / "unseen-0.5-best-sampled-m20.json")
     assert (found["num_actions"], found["set_size"]) == (128 + 256, 20)
 
@@ -149,19 +161,22 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
     assert read_json(hvae_run / "config.json") == before
 
 
-def test_an_embed_report(encoder_run: Path, runs: Path) -> None:
-    run("embed", "--budget=smoke", "--representation=hvae-relative", f"--runs={runs}")
+def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path) -> None:
+    """Of a run that is complete, and of two that are made; for `hvae` see below."""
+    common = ("--budget=smoke", f"--runs={runs}")
+    names = ("hvae-relative", "hvae-onehot-oracle", "vae")
+    jobs = [(*common, f"--representation={name}") for name in names]
+    jobs[-1] = (*jobs[-1], "--set=model.actions_per_batch=16")
+    outputs = run_several("embed", jobs)
+    assert "already complete" in outputs[0]
     numbers = read_json(encoder_run / "evaluation" / "representation.json")
     assert 0.0 <= numbers["purity_held_out"] <= 1.0
     assert len(numbers["linear_r2"]["net displacement"]) == 2
     assert len(numbers["linear_r2"]["per-move coordinates"]) == 10
-
-
-@pytest.mark.parametrize("representation", ["hvae", "hvae-onehot", "vae"])
-def test_other_representations_train(runs: Path, representation: str) -> None:
-    run("embed", "--budget=smoke", f"--representation={representation}", f"--runs={runs}")
-    path = runs / "grid_world" / f"embed-{representation}-default-smoke-31"
-    assert RepresentationTable.load(path / "table.npz").vectors.shape == (1024, 16)
+    for name, part in zip(names[1:], ("all", "train"), strict=True):
+        path = runs / "grid_world" / f"embed-{name}-default-smoke-31"
+        assert read_json(path / "config.json")["train_on"] == part
+        assert RepresentationTable.load(path / "table.npz").vectors.shape == (1024, 16)
 
 
 def test_train_makes_what_it_needs(tmp_path: Path) -> None:
@@ -170,17 +185,18 @@ def test_train_makes_what_it_needs(tmp_path: Path) -> None:
     assert "1024 actions x 16 recordings" in output
     assert "Training hvae (8 steps" in output
     assert "update 4 of 4" in output
+    path = tmp_path / "grid_world" / "embed-hvae-default-smoke-31"
+    assert RepresentationTable.load(path / "table.npz").vectors.shape == (1024, 16)
 
 
 def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
-    environment = {**os.environ, "JAX_DEBUG_KEY_REUSE": "1"}
     run(
         "train",
         "--budget=smoke",
         "--representation=hvae",
         "--representation_budget=smoke",
         f"--runs={tmp_path}",
-        environment=environment,
+        environment={**ENVIRONMENT, "JAX_DEBUG_KEY_REUSE": "1"},
     )
 
 
@@ -210,8 +226,10 @@ def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:
         "--budget=smoke",
         "--representation=gt12",
         f"--runs={runs}",
-        "--set=num_updates=120",
+        "--set=num_updates=80",
+        "--set=ppo.num_epochs=1",
         "--set=ppo.lr_steps=40000",
+        "--set=loop.evaluation_episodes=8",
     )
     calm, killed = runs / "calm", runs / "killed"
     run("train", *flags, f"--workdir={calm}")
@@ -220,7 +238,11 @@ def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:
     kills = 0
     while kills < 3:
         process = subprocess.Popen(
-            command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+            command,
+            cwd=ROOT,
+            env={**os.environ, **ENVIRONMENT},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
         )
         steps = newest_step(killed)
         while process.poll() is None and newest_step(killed) == steps:

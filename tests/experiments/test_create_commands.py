@@ -1,14 +1,14 @@
 """CREATE through the commands at smoke budget: train, save, and evaluate in another process.
 
 Every level, and on top every method, representation and variant: `RUNS` gives each of them to a
-level, since a run costs seconds. Then fine-tuning, and the studies of the analysis.
+level. Then fine-tuning, and the studies of the analysis. What is made as elsewhere is `slow`.
 """
 
 from __future__ import annotations
 
 import csv
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,6 +46,9 @@ POOL = ("--set=pool.on_worker_death=restart", "--set=pool.max_restarts=3")
 SHORT = ("--set=num_updates=1", "--set=loop.evaluation_episodes=2")
 
 
+Job = tuple[str, ...]
+
+
 @dataclass(frozen=True)
 class Run:
     """A run of `train`; `representation` may be a path below the folder of all runs."""
@@ -57,24 +60,29 @@ class Run:
     split: str = "default"
 
 
-RUNS = {
+# An engineered table, an encoder, a fixed set, and what is unlike choices by utility.
+FEW = {
     "push": Run("create-push", flags=()),
     "obstacle": Run("create-obstacle", representation=EMBED.format("hvae")),
+    "collide": Run("create-collide", "continuous"),
+    "moving": Run("create-moving", "nearest-neighbour"),
+    "analysis": Run("create-push-analysis"),
+}
+OTHERS = {
     "seesaw": Run("create-seesaw", representation=EMBED.format("vae")),
     "navigate": Run("create-navigate", representation=EMBED.format("hvae-oracle")),
     "ladder": Run("create-ladder", representation=EMBED.format("hvae-position")),
     "cannon": Run("create-cannon", representation="mine.npz"),
     "belt": Run("create-belt", "no-entropy"),
     "buckets": Run("create-buckets", "random"),
-    "collide": Run("create-collide", "continuous"),
-    "moving": Run("create-moving", "nearest-neighbour"),
     "basket": Run("create-basket", "no-subsampling"),
     "funnel": Run("create-funnel", representation="random-32"),
     "conditioned": Run("create-push", flags=(*SHORT, "--set=conditions_position=true")),
     "no-subgoals": Run("create-push-no-subgoals"),
     "full": Run("create-push", flags=(*SHORT, "--split=full"), split="full"),
-    "analysis": Run("create-push-analysis"),
 }
+RUNS = FEW | OTHERS
+NAMES = [*FEW, *(pytest.param(name, marks=pytest.mark.slow) for name in OTHERS)]
 HIT_REWARD = {"create-obstacle": 2.0, "create-push-no-subgoals": 0.0}
 
 
@@ -82,46 +90,97 @@ def split_of(name: str) -> ActionSplit:
     return analysis_split() if name == "analysis" else published_split(RUNS[name].split)
 
 
-@pytest.fixture(scope="module")
-def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recordings, four encoders and a table of the user's own."""
-    folder = tmp_path_factory.mktemp("runs")
+def embed(folder: Path, *names: str) -> None:
     jobs = []
-    for name in ("hvae", "vae", "hvae-oracle", "hvae-position"):
+    for name in names:
         size = "observation_latent" if name == "vae" else "action_latent"
         flags = (f"--representation={name}", f"--set=model.{size}={WIDTH}", f"--runs={folder}")
+        # As many as a step of training takes; most of the time is for recording 2,366 tools.
+        flags = (*flags, "--observations_per_action=2")
         jobs.append(("--task=create-push", *COMMON, *flags))
     run_several("embed", jobs)
-    vectors = np.random.default_rng(0).normal(size=(tool_universe().num_actions, WIDTH))
-    np.savez(folder / "mine.npz", ids=np.arange(len(vectors)), vectors=vectors)
-    return folder
 
 
-@pytest.fixture(scope="module")
-def trained(runs: Path) -> dict[str, str]:
-    """What `train` printed for each of `RUNS`."""
+def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
+    """What `train` prints for each of `RUNS`."""
     jobs = []
-    for name, run in RUNS.items():
+    for name in names:
+        run = RUNS[name]
         given = runs / run.representation
         representation = given if given.exists() else run.representation
         flags = (f"--representation={representation}", f"--workdir={runs / name}", *run.flags)
         jobs.append((f"--task={run.task}", f"--method={run.method}", *COMMON, *flags))
-    return dict(zip(RUNS, run_several("train", jobs, probe=ACTED_IDS), strict=True))
+    return dict(zip(names, run_several("train", jobs, probe=ACTED_IDS), strict=True))
+
+
+def evaluate(runs: Path, names: Iterable[str], more: Mapping[str, Job]) -> dict[str, str]:
+    """What `evaluate` prints for each of `RUNS` on its test tools, and for more jobs."""
+    common = (f"--episodes={EPISODES}", "--workers=1")
+    jobs = [*((f"--run={runs / name}", *common) for name in names), *more.values()]
+    outputs = run_several("evaluate", jobs, probe=ACTED_IDS)
+    return dict(zip([*names, *more], outputs, strict=True))
 
 
 @pytest.fixture(scope="module")
-def evaluated(runs: Path, trained: dict[str, str]) -> dict[str, str]:
-    """What `evaluate` printed for each of `RUNS`, and for `push` in a world without subgoals."""
-    assert trained
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Recordings, and an encoder of them."""
+    folder = tmp_path_factory.mktemp("runs")
+    embed(folder, "hvae")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def encoders(runs: Path) -> Path:
+    """The same with three other encoders, and a table of the user's own."""
+    embed(runs, "vae", "hvae-oracle", "hvae-position")
+    vectors = np.random.default_rng(0).normal(size=(tool_universe().num_actions, WIDTH))
+    np.savez(runs / "mine.npz", ids=np.arange(len(vectors)), vectors=vectors)
+    return runs
+
+
+@pytest.fixture(scope="module")
+def trained_few(runs: Path) -> dict[str, str]:
+    return train(runs, FEW)
+
+
+@pytest.fixture(scope="module")
+def trained_all(trained_few: dict[str, str], encoders: Path) -> dict[str, str]:
+    return trained_few | train(encoders, OTHERS)
+
+
+@pytest.fixture(scope="module")
+def evaluated_few(runs: Path, trained_few: dict[str, str]) -> dict[str, str]:
+    """Also of `push` in a world without subgoals."""
+    assert trained_few
     twin = runs / "twin"
     shutil.copytree(runs / "push", twin)
     text = (twin / "config.json").read_text()
     (twin / "config.json").write_text(text.replace('"create-push"', '"create-push-no-subgoals"'))
-    long = "--episodes=20"
-    jobs = [(f"--run={runs / name}", f"--episodes={EPISODES}", "--workers=1") for name in RUNS]
-    jobs += [(f"--run={runs / name}", "--sets=train", long) for name in ("push", "twin")]
-    names = [*RUNS, "push on train", "twin on train"]
-    return dict(zip(names, run_several("evaluate", jobs, probe=ACTED_IDS), strict=True))
+    flags = ("--sets=train", "--episodes=20")
+    more = {f"{name} on train": (f"--run={runs / name}", *flags) for name in ("push", "twin")}
+    return evaluate(runs, FEW, more)
+
+
+@pytest.fixture(scope="module")
+def evaluated_others(runs: Path, trained_all: dict[str, str]) -> dict[str, str]:
+    assert trained_all
+    return evaluate(runs, OTHERS, {})
+
+
+@pytest.fixture
+def trained(request: pytest.FixtureRequest, name: str) -> str:
+    """What `train` printed for a run."""
+    outputs = request.getfixturevalue("trained_few" if name in FEW else "trained_all")
+    output: str = outputs[name]
+    return output
+
+
+@pytest.fixture
+def evaluated(request: pytest.FixtureRequest, name: str) -> str:
+    """What `evaluate` printed for a run."""
+    outputs = request.getfixturevalue("evaluated_few" if name in FEW else "evaluated_others")
+    output: str = outputs[name]
+    return output
 
 
 def evaluation(path: Path, name: str = "test") -> dict[str, Any]:
@@ -139,8 +198,8 @@ def test_every_level_is_there() -> None:
     assert levels == {level.lower() for level in LEVELS}
 
 
-@pytest.mark.parametrize("name", RUNS)
-def test_a_run_is_trained_and_saved(runs: Path, trained: dict[str, str], name: str) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_is_trained_and_saved(runs: Path, trained: str, name: str) -> None:
     run, path, split = RUNS[name], runs / name, split_of(name)
     updates = 2 if name == "push" else 1
     config = read_json(path / "config.json")
@@ -153,16 +212,16 @@ def test_a_run_is_trained_and_saved(runs: Path, trained: dict[str, str], name: s
     assert [line["step"] for line in lines if "validation/is_success" in line][-1] == updates
     assert Checkpointer(path / "checkpoints").steps("latest")[-1] == updates
     known = {*split.train.tolist(), *split.validation.tolist(), *split.always_available.tolist()}
-    chosen = acted(trained[name])
+    chosen = acted(trained)
     assert chosen <= known, "no test tool is used before the evaluation of test tools"
     assert chosen & {*split.train.tolist()}
     assert chosen & {*split.validation.tolist()}
 
 
-@pytest.mark.parametrize("name", RUNS)
-def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: dict[str, str], name: str) -> None:
+@pytest.mark.parametrize("name", NAMES)
+def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: str, name: str) -> None:
     split, found, mean = split_of(name), evaluation(runs / name), means(runs / name)
-    chosen = acted(evaluated[name])
+    chosen = acted(evaluated)
     assert chosen <= {*split.test.tolist(), *split.always_available.tolist()}
     assert chosen & {*split.test.tolist()}
     assert (found["num_episodes"], found["num_actions"]) == (EPISODES, len(split.test))
@@ -183,8 +242,9 @@ def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: dict[str, str],
     assert -1e-5 <= above <= 10.0 * mean["is_success"] + 1e-5
 
 
-def test_what_methods_are_made_of(runs: Path, trained: dict[str, str]) -> None:
-    assert trained
+@pytest.mark.slow
+def test_what_methods_are_made_of(runs: Path, trained_all: dict[str, str]) -> None:
+    assert trained_all
     config = {name: read_json(runs / name / "config.json") for name in RUNS}
     size = {
         name: {key: value.shape for key, value in parameters(runs / name).items()}
@@ -206,8 +266,11 @@ def test_what_methods_are_made_of(runs: Path, trained: dict[str, str]) -> None:
     assert size["conditioned"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
 
 
-def test_representations_are_those_that_were_asked_for(runs: Path, trained: dict[str, str]) -> None:
-    assert trained
+@pytest.mark.slow
+def test_representations_are_those_that_were_asked_for(
+    runs: Path, trained_all: dict[str, str]
+) -> None:
+    assert trained_all
     used = {name: RepresentationTable.load(runs / name / "table.npz") for name in RUNS}
     embedded = {name: run.representation for name, run in RUNS.items() if "/" in run.representation}
     for name, representation in embedded.items():
@@ -226,10 +289,10 @@ def test_representations_are_those_that_were_asked_for(runs: Path, trained: dict
 
 
 def test_subgoals_and_hits_are_worth_nothing_without_them(
-    runs: Path, evaluated: dict[str, str]
+    runs: Path, evaluated_few: dict[str, str]
 ) -> None:
     """The same policy does the same in both worlds, and is paid for the target's hit in one."""
-    assert acted(evaluated["push on train"]) == acted(evaluated["twin on train"])
+    assert acted(evaluated_few["push on train"]) == acted(evaluated_few["twin on train"])
     with_hits, without = means(runs / "push", "train"), means(runs / "twin", "train")
     assert with_hits["target_hit"] > 0.0
     paid = with_hits.pop("episode_return") - without.pop("episode_return")
@@ -237,16 +300,23 @@ def test_subgoals_and_hits_are_worth_nothing_without_them(
     assert with_hits == without
 
 
-def test_finetuning_of_each_kind(runs: Path, trained: dict[str, str], tmp_path: Path) -> None:
+SOURCES = {"ours": "push", "nearest-neighbour": "moving"}
+KINDS = [(method, start) for method in SOURCES for start in ("warm", "scratch")]
+
+
+@pytest.mark.parametrize(
+    "kinds", [KINDS[:2], pytest.param(KINDS[2:], marks=pytest.mark.slow)], ids=list(SOURCES)
+)
+def test_finetuning_of_each_kind(
+    runs: Path, trained_few: dict[str, str], tmp_path: Path, kinds: list[tuple[str, str]]
+) -> None:
     """Both policies, warm and from scratch, with all test tools as one set (spec method 9)."""
-    assert trained
-    sources = {"ours": "push", "nearest-neighbour": "moving"}
-    kinds = [(method, start) for method in sources for start in ("warm", "scratch")]
+    assert trained_few
     jobs = []
     for method, start in kinds:
         flags = ("--seed=7", *POOL, *(["--scratch"] if start == "scratch" else []))
         workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
-        jobs.append((f"--run={runs / sources[method]}", *COMMON, *flags, workdir))
+        jobs.append((f"--run={runs / SOURCES[method]}", *COMMON, *flags, workdir))
     outputs = run_several("finetune", jobs, probe=ACTED_IDS)
     split = published_split()
     test = {*split.test.tolist(), *split.always_available.tolist()}
@@ -259,7 +329,7 @@ def test_finetuning_of_each_kind(runs: Path, trained: dict[str, str], tmp_path: 
         assert config["method"] == {"ours": "no-subsampling"}.get(method, method)
         assert config["start"] == {"warm": f"{method}, seed 31"}.get(start, "fresh parameters")
         assert metrics.read(path)[-1]["step"] == 1
-        found, source = parameters(path), parameters(runs / sources[method])
+        found, source = parameters(path), parameters(runs / SOURCES[method])
         moved = {
             k: np.abs(found[k] - source[k]).max() for k in found if k in source and k[0] in "ce"
         }
@@ -278,22 +348,30 @@ STUDIES: dict[str, tuple[str, Expected]] = {
 }
 
 
-def test_studies_of_the_analysis(runs: Path, trained: dict[str, str], tmp_path: Path) -> None:
-    assert trained
+@pytest.mark.parametrize(
+    "names",
+    [["embedding"], pytest.param(["angle", "angle-per-class", "mix"], marks=pytest.mark.slow)],
+    ids="-".join,
+)
+def test_studies_of_the_analysis(
+    runs: Path, trained_few: dict[str, str], tmp_path: Path, names: list[str]
+) -> None:
+    assert trained_few
     path = runs / "analysis"
     jobs = [
         (
             f"--study={name}",
             f"--run={path}",
-            f"--values={value}",
+            f"--values={STUDIES[name][0]}",
             "--episodes=4",
             f"--out={tmp_path}",
         )
-        for name, (value, _) in STUDIES.items()
+        for name in names
     ]
     outputs = run_several("analyze", jobs, probe=ACTED_IDS)
     table = RepresentationTable.load(path / "table.npz").vectors
-    for (name, (value, expected)), output in zip(STUDIES.items(), outputs, strict=True):
+    for name, output in zip(names, outputs, strict=True):
+        value, expected = STUDIES[name]
         ids = expected(table)
         no_op = analysis_split().always_available
         assert acted(output) <= {*ids.tolist(), *no_op.tolist()}

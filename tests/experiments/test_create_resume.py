@@ -12,9 +12,9 @@ import pytest
 
 from jaxnew import metrics
 from jaxnew.checkpoint import Checkpointer
-from tests.experiments.commands import ROOT, read_json
+from tests.experiments.commands import ENVIRONMENT, ROOT, read_json
 from tests.experiments.create_runs import saved, timeless
-from tests.experiments.several import ENVIRONMENT, run_several
+from tests.experiments.several import run_several
 
 pytestmark = pytest.mark.integration
 

@@ -17,7 +17,7 @@ from experiments._training import load_state, load_trainer
 from jaxnew import metrics
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.task import Task
-from tests.experiments.commands import ROOT, read_json, run
+from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
 from tests.toy_task import TASK
 
 pytestmark = pytest.mark.integration
@@ -79,7 +79,11 @@ def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) ->
     killed = tmp_path / "killed"
     command = [sys.executable, "-m", "experiments.train", *COMMON, f"--workdir={killed}"]
     process = subprocess.Popen(
-        command, cwd=ROOT, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        command,
+        cwd=ROOT,
+        env={**os.environ, **ENVIRONMENT},
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
     )
     while process.poll() is None and not Checkpointer(killed / "checkpoints").steps("latest"):
         time.sleep(0.005)

@@ -11,58 +11,90 @@ from experiments._artifacts import Domain
 from experiments._flags import UsageError, load_task
 from experiments._methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew import metrics
-from tests.experiments.commands import read_json, run
+from tests.experiments.commands import OPTIMIZED, read_json, run
+from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
 
 
+# (task, method, representation) -> sizes of the sets that train and test episodes offer.
+SIZES = {
+    ("grid_world", "ours", "gt12"): (50, 50),
+    ("grid_world", "nearest-neighbour", "gt12"): (512, 50),
+    ("grid_world", "continuous", "gt12"): (50, 50),
+    ("grid_world", "no-subsampling", "gt12"): (512, 50),
+    ("grid_world", "no-entropy", "random-12"): (50, 50),
+    ("grid_world", "random", "gt12"): (50, 50),
+    ("recommender", "ours", "product"): (50, 50),
+}
+FULL = ("recommender", "nearest-neighbour", "product-mu")
+SIZES_OF_FULL = (5000, 50)
+FOLDER = "{1}-{2}-default-smoke-31"
+SHORT = ("--set=num_updates=1", "--set=loop.evaluation_episodes=8")
+EPISODES = ("--sets=train,test", "--episodes=32")
+
+
+def training(name: tuple[str, str, str], runs: Path) -> tuple[str, ...]:
+    """Flags of `train`."""
+    flags = (f"--task={name[0]}", f"--method={name[1]}", f"--representation={name[2]}")
+    return (*flags, "--budget=smoke", f"--runs={runs}")
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("runs")
+    """The folder of a run for each of `SIZES`."""
+    folder = tmp_path_factory.mktemp("runs")
+    run_several("train", [(*training(name, folder), *SHORT) for name in SIZES])
+    return folder
 
 
-@pytest.mark.integration
-@pytest.mark.parametrize(
-    ("task", "representation", "method", "sizes"),
-    [
-        ("grid_world", "gt12", "continuous", (50, 50)),
-        ("grid_world", "gt12", "no-subsampling", (512, 50)),
-        ("grid_world", "random-3", "no-entropy", (50, 50)),
-        ("recommender", "product", "ours", (50, 50)),
-        ("recommender", "product-mu", "nearest-neighbour", (5000, 50)),
-    ],
-)
-def test_methods_train_and_are_evaluated(
-    runs: Path, task: str, representation: str, method: str, sizes: tuple[int, int]
-) -> None:
-    run(
-        "train",
-        f"--task={task}",
-        f"--method={method}",
-        f"--representation={representation}",
-        "--budget=smoke",
-        f"--runs={runs}",
-    )
-    path = runs / task / f"{method}-{representation}-default-smoke-31"
-    run("evaluate", f"--run={path}", "--sets=train,test", "--episodes=32")
-    for name, size in zip(("train", "test"), sizes, strict=True):
-        result = read_json(path / "evaluation" / f"{name}-best-sampled-m{size}.json")
+@pytest.fixture(scope="module")
+def evaluated(runs: Path) -> Path:
+    """The same, each run evaluated in another process."""
+    paths = [runs / name[0] / FOLDER.format(*name) for name in SIZES]
+    run_several("evaluate", [(f"--run={path}", *EPISODES) for path in paths])
+    return runs
+
+
+def check_evaluations(path: Path, sizes: tuple[int, int]) -> None:
+    for part, size in zip(("train", "test"), sizes, strict=True):
+        result = read_json(path / "evaluation" / f"{part}-best-sampled-m{size}.json")
         assert result["set_size"] == size
         assert result["num_episodes"] == 32
 
 
 @pytest.mark.integration
+@pytest.mark.parametrize("name", SIZES, ids="-".join)
+def test_methods_train_and_are_evaluated(evaluated: Path, name: tuple[str, str, str]) -> None:
+    path = evaluated / name[0] / FOLDER.format(*name)
+    config = read_json(path / "config.json")
+    assert (config["task"], config["method"], config["representation"]) == name
+    check_evaluations(path, SIZES[name])
+
+
+@pytest.mark.integration
+@pytest.mark.slow
+def test_a_fixed_set_of_5000_trains_and_is_evaluated(tmp_path: Path) -> None:
+    """As users run it, for it computes a lot."""
+    run("train", *training(FULL, tmp_path), environment=OPTIMIZED)
+    path = tmp_path / FULL[0] / FOLDER.format(*FULL)
+    run("evaluate", f"--run={path}", *EPISODES, environment=OPTIMIZED)
+    check_evaluations(path, SIZES_OF_FULL)
+
+
+@pytest.mark.integration
 def test_a_policy_goes_on_with_new_actions(runs: Path) -> None:
     """Both kinds of policy, warm and from scratch; the discrete head is as large as its set."""
+    jobs, folders = [], []
     for method in ("ours", "nearest-neighbour"):
-        flags = ["--representation=gt12", "--budget=smoke", f"--method={method}"]
-        run("train", *flags, f"--runs={runs}")
-        path = runs / "grid_world" / f"{method}-gt12-default-smoke-31"
-        for start, flag in (("warm", []), ("scratch", ["--scratch"])):
-            run("finetune", f"--run={path}", "--budget=smoke", *flag)
-            folder = path / f"finetune-{start}-smoke-31"
-            assert read_json(folder / "config.json")["trained_on"] == "test"
-            assert metrics.read(folder)[-1]["step"] == 1
+        path = runs / "grid_world" / FOLDER.format("", method, "gt12")
+        for start, flags in (("warm", ()), ("scratch", ("--scratch",))):
+            jobs.append((f"--run={path}", "--budget=smoke", *flags))
+            folders.append(path / f"finetune-{start}-smoke-31")
+    run_several("finetune", jobs)
+    for folder in folders:
+        assert read_json(folder / "config.json")["trained_on"] == "test"
+        assert metrics.read(folder)[-1]["step"] == 1
     assert "cannot be fine-tuned" in run("finetune", f"--run={folder}", fails=True)
 
 

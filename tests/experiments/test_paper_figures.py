@@ -276,6 +276,7 @@ def test_a_figure_is_made_stopped_and_finished(tmp_path: Path) -> None:
     process = subprocess.Popen(
         [sys.executable, "-m", "experiments.figures", *flags[1:]],
         cwd=commands.ROOT,
+        env={**os.environ, **commands.ENVIRONMENT},
         start_new_session=True,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,

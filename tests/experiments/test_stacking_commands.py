@@ -27,7 +27,6 @@ from tests.experiments.stacking_probes import EPISODES, seen
 from tests.experiments.stacking_runs import (
     ALIKE,
     EMBED,
-    ENVIRONMENT,
     OTHERS,
     RUNS,
     WATCHED,
@@ -197,7 +196,7 @@ def test_new_pictures_are_encoded_and_acted_with(
     drawn = np.load(tmp_path / "known.npz")["recordings"]
     # Rounded by other programs.
     assert np.abs(drawn.astype(int) - stored[ids]).max() <= 1
-    outputs = run_several("embed", jobs, environment=ENVIRONMENT)
+    outputs = run_several("embed", jobs)
     found = {name: RepresentationTable.load(path) for name, path in tables.items()}
     own = RepresentationTable.load(runs / EMBED.format("hvae") / "table.npz").rows(np.sort(ids))
     for output, table in zip(outputs, found.values(), strict=True):
@@ -206,7 +205,7 @@ def test_new_pictures_are_encoded_and_acted_with(
     off = {name: np.abs(table.vectors - own).max() for name, table in found.items()}
     assert off["known"] < 0.1 * off["new"], "the same pictures, and others"
     job = (f"--run={runs / 'line'}", f"--table={tables['new']}", f"--episodes={EPISODES}")
-    (output,) = run_several("evaluate", [job], probe=WATCHED, environment=ENVIRONMENT)
+    (output,) = run_several("evaluate", [job], probe=WATCHED)
     assert seen(output).placed
     assert seen(output).placed <= {*ids.tolist()}
     result = evaluation(runs / "line", "table-new_table")
@@ -311,7 +310,7 @@ def test_finetuning_of_each_kind(
         flags = (*flags, *(["--scratch"] if start == "scratch" else []))
         workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
         jobs.append((f"--run={runs / sources[method]}", *flags, workdir))
-    outputs = run_several("finetune", jobs, probe=WATCHED, environment=ENVIRONMENT)
+    outputs = run_several("finetune", jobs, probe=WATCHED)
     test = published_split().test
     for (method, start), output in zip(kinds, outputs, strict=True):
         path = tmp_path / f"{method}-{start}"
@@ -339,7 +338,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(
     assert trained_alike
     path = tmp_path / "stopped"
     job = RUNS["line"].training(runs, path)
-    process = start_several("train", [job], probe=WATCHED, environment=ENVIRONMENT)
+    process = start_several("train", [job], probe=WATCHED)
     log = path / "metrics.jsonl"
     while process.poll() is None and not (log.exists() and log.stat().st_size):
         time.sleep(0.05)
@@ -347,7 +346,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(
     (output,) = finish_several(process)
     assert "stopped at step 1; run again to go on" in output
     assert Checkpointer(path / "checkpoints").steps("latest")[-1] == 1
-    (output,) = run_several("train", [job], probe=WATCHED, environment=ENVIRONMENT)
+    (output,) = run_several("train", [job], probe=WATCHED)
     assert "at step 1 of 2" in output
     calm = runs / "line"
     for kind in ("best", "latest"):
@@ -368,7 +367,7 @@ def test_members_of_a_sweep_share_their_batches(
     flags = [flag for flag in run.training(runs, tmp_path / "sweep") if "seed" not in flag]
     job = (*flags, "--seeds=31,41", "--members_at_once=2")
     probe = f"{WATCHED}_on_one_core"
-    (output,) = run_several("sweep", [job], probe=probe, environment=ENVIRONMENT)
+    (output,) = run_several("sweep", [job], probe=probe)
     engine = seen(output)
     assert engine.batches == {(2, 2), (2, EPISODES)}
     split = published_split()

@@ -14,7 +14,7 @@ from experiments._flags import UsageError, load_task
 from experiments._training import TrainConfig
 from experiments.sweep import member_configs, parse_seeds
 from jaxnew.representation.table import engineered_table
-from tests.experiments.commands import ROOT
+from tests.experiments.commands import OPTIMIZED, ROOT
 
 
 @pytest.fixture(scope="module")
@@ -26,11 +26,12 @@ def base() -> TrainConfig:
 
 @pytest.mark.integration
 def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count=8"
+    # Programs that are not optimized are not as alike.
+    flags = f"{OPTIMIZED['XLA_FLAGS']} --xla_force_host_platform_device_count=8"
     done = subprocess.run(
         [sys.executable, "-m", "tests.experiments.sweep_on_devices"],
         cwd=ROOT,
-        env={**os.environ, "XLA_FLAGS": flags},
+        env={**os.environ, **OPTIMIZED, "XLA_FLAGS": flags},
         capture_output=True,
         text=True,
         timeout=400,
