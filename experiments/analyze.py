@@ -20,10 +20,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._searches import GRIDS, search
-from experiments._studies import STUDIES, study_runs
-from experiments._study_report import Study, write_study
+from experiments.pipeline import flags as flag
+from experiments.reports.searches import GRIDS, search
+from experiments.reports.studies import STUDIES, study_runs
+from experiments.reports.study_report import Study, write_study
 
 STUDY = flags.DEFINE_string(
     "study", None, f"What to study: {', '.join([*STUDIES, *GRIDS])}, or one of the task's own."

@@ -14,10 +14,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._anchors import FOLDER, Anchors, Summary, table_header, table_row
-from experiments._artifacts import Domain
-from experiments._training import EVALUATION_SEED
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.training import EVALUATION_SEED
+from experiments.reports.anchors import FOLDER, Anchors, Summary, table_header, table_row
 
 _STACKING = "shape_stacking"
 
@@ -52,7 +52,7 @@ def main() -> None:
 
 def recommend(domain: Domain, parts: list[str], sizes: list[int], episodes: int) -> None:
     """Prints the anchors of the Recommender."""
-    from experiments import _recommender_anchors as recommender
+    from experiments.untrained import recommender
 
     sizes, episodes = sizes or list(recommender.SET_SIZES), episodes or recommender.EPISODES
     for line in recommender.lines(domain, parts, sizes, episodes):
@@ -78,7 +78,7 @@ def stack(
       UsageError: several sizes.
     """
     from envs_mjx.shape_stacking.engines import make_engine
-    from experiments import _stacking_anchors as stacking
+    from experiments.untrained import stacking
 
     if len(sizes) > 1:
         raise flag.UsageError(f"A file of anchors has sets of one size; got {sizes}.")

@@ -11,9 +11,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments import _flags as flag
-from experiments._artifacts import Domain, collect_observations, parse_representation
-from experiments._stage_one_flags import NUM_RECORDINGS, stores_drawn
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import Domain, collect_observations, parse_representation
+from experiments.pipeline.stage_one_flags import NUM_RECORDINGS, stores_drawn
 
 
 def main() -> None:

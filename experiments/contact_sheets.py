@@ -25,7 +25,7 @@ from envs_host.create.levels import load_level
 from envs_host.create.levels.registry import BUILT_IN_NAMES
 from envs_host.create.sprites import Sprite
 from envs_host.create.tools import Tool, ToolClass, all_tools
-from experiments import _flags as flag
+from experiments.pipeline import flags as flag
 
 SMOKE_LEVEL = "GoalTest"
 NUM_EXAMPLES = 3

@@ -12,18 +12,18 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from experiments import _flags as flag
 from experiments import figures
-from experiments._artifacts import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import (
     TABLE_FILE,
     Domain,
     find_table,
     print_report,
     train_representation,
 )
-from experiments._evaluation import evaluate_on, record
-from experiments._paper import paper_value
-from experiments._training import load_state, load_trainer, train_policy
+from experiments.pipeline.evaluation import evaluate_on, record
+from experiments.pipeline.training import load_state, load_trainer, train_policy
+from experiments.reports.paper import paper_value
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._artifacts import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import (
     REPRESENTATION_SEED,
     TABLE_FILE,
     Domain,
@@ -22,7 +22,7 @@ from experiments._artifacts import (
     print_report,
     train_representation,
 )
-from experiments._stage_one_flags import NUM_RECORDINGS, stores_drawn
+from experiments.pipeline.stage_one_flags import NUM_RECORDINGS, stores_drawn
 from jaxnew import observations
 from jaxnew.representation.table import RepresentationTable
 

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._evaluation import evaluate_on, record
-from experiments._training import EVALUATION_SEED, load_state, load_trainer
+from experiments.pipeline import flags as flag
+from experiments.pipeline.evaluation import evaluate_on, record
+from experiments.pipeline.training import EVALUATION_SEED, load_state, load_trainer
 from jaxnew.actions import ActionSplit, ActionUniverse, load_ids, mixture_ids
 from jaxnew.representation.table import RepresentationTable
 

@@ -26,11 +26,10 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments import _paper_figures
-from experiments import _plots as plots
-from experiments._anchors import notes_of
-from experiments._drawing import (
+from experiments.pipeline import flags as flag
+from experiments.reports import paper_figures, plots
+from experiments.reports.anchors import notes_of
+from experiments.reports.drawing import (
     BAR_SPLITS,
     CURVE_SPLITS,
     bars_figure,
@@ -39,9 +38,9 @@ from experiments._drawing import (
     standard_rows,
     tsne_figures,
 )
-from experiments._episode import episode_animation
-from experiments._results import ResultRow, as_csv, as_markdown, result_rows
-from experiments._runs import Group, group_runs, read_runs
+from experiments.reports.episode import episode_animation
+from experiments.reports.results import ResultRow, as_csv, as_markdown, result_rows
+from experiments.reports.runs import Group, group_runs, read_runs
 
 __all__ = ["episode_animation", "make_figures"]
 
@@ -52,19 +51,19 @@ def define_flags() -> None:
     flags.DEFINE_string("out", None, "Where to write; default: `figures/` of the one run.")
     flags.DEFINE_bool("pdf", False, "Also write every figure as PDF.")
     flags.DEFINE_bool("episode", False, "Also play a zero-shot episode and write it as a GIF.")
-    _paper_figures.define_flags()
+    paper_figures.define_flags()
 
 
 def main() -> None:
     values = flags.FLAGS
     if values.figure == ["8"] and values.run:
-        for file in _paper_figures.film_given(values):
+        for file in paper_figures.film_given(values):
             print(file)
         return
     if values.figure and values.run:
         raise flag.UsageError("Give --run, to draw these runs, or --figure, to find and make them.")
     if values.figure:
-        for file in _paper_figures.make(values):
+        for file in paper_figures.make(values):
             print(file)
         return
     paths = [Path(path) for path in values.run]

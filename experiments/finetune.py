@@ -20,11 +20,11 @@ from typing import Any
 import jax
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._artifacts import TABLE_FILE
-from experiments._machinery import pool_assignments
-from experiments._methods import adapted
-from experiments._training import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import TABLE_FILE
+from experiments.pipeline.machinery import pool_assignments
+from experiments.pipeline.methods import adapted
+from experiments.pipeline.training import (
     TrainConfig,
     Trainer,
     load_state,

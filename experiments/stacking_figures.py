@@ -22,19 +22,11 @@ from envs_mjx.shape_stacking import rules, scene, shape_library
 from envs_mjx.shape_stacking.engines import Engine, make_engine
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments import _flags as flag
-from experiments import _stacking as stacking
-from experiments._stacking import SETTLE_ONLY, Drop
+from experiments.pipeline import flags as flag
+from experiments.untrained import towers as stacking
+from experiments.untrained.towers import FLAT_TOPPED, SETTLE_ONLY, Drop
 
 SET_SIZE = 20
-FLAT_TOPPED = (
-    "horizontal_rectangle",
-    "arch",
-    "rectangle",
-    "half_rectangle",
-    "cube",
-    "cylinder",
-)
 # Two engines' values that are farther apart than this, m, are listed.
 _DIFFERENT_M = 0.005
 

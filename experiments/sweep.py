@@ -21,10 +21,10 @@ import numpy as np
 from absl import flags
 from flax import struct
 
-from experiments import _flags as flag
-from experiments._artifacts import Domain, find_table
-from experiments._methods import file_name, variant_of
-from experiments._training import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import Domain, find_table
+from experiments.pipeline.methods import file_name, variant_of
+from experiments.pipeline.training import (
     EVALUATION_SEED,
     SPLITS_WATCHED,
     TrainConfig,

@@ -9,11 +9,11 @@ from pathlib import Path
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments._artifacts import Domain, find_table
-from experiments._machinery import pool_assignments, with_pool_settings
-from experiments._methods import variant_of
-from experiments._training import train_policy
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import Domain, find_table
+from experiments.pipeline.machinery import pool_assignments, with_pool_settings
+from experiments.pipeline.methods import variant_of
+from experiments.pipeline.training import train_policy
 
 REPRESENTATION_BUDGET = flags.DEFINE_string(
     "representation_budget", None, "Budget of a representation to be trained; default: --budget."

@@ -29,6 +29,9 @@ LAYERS = (
 )
 SIDEWAYS = {("ppo", "rollout"), ("host_evaluation", "evaluation")}
 
+# Of `experiments`, lowest first; commands and benchmarks are above them.
+EXPERIMENTS = ("tasks", "pipeline", "reports", "untrained")
+
 HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
     "mujoco": {"envs_mjx.shape_stacking"},
@@ -150,11 +153,23 @@ def why_not(module: str, package: str, name: str) -> str | None:
         return "a domain or policy of one's own needs jaxnew only"
     if package == "experiments" and is_within(name, {"examples"}):
         return "experiments find what is the user's own by its place"
+    if package == "experiments" and is_within(name, {"experiments"}):
+        here, there = (floor_of(each) for each in (module, name))
+        if there > here:
+            return f"what commands share is layered {EXPERIMENTS}, and knows no command"
     if package == "envs_host":
         is_standard = name.split(".")[0] in {*sys.stdlib_module_names, "__future__"}
         if not is_standard and not is_within(name, HOST_MAY_IMPORT):
             return f"host workers may import {sorted(HOST_MAY_IMPORT)}"
     return None
+
+
+def floor_of(module: str) -> int:
+    """Index into `EXPERIMENTS`, beyond its end for commands; -1 for the empty package itself."""
+    parts = module.split(".")
+    if len(parts) == 1:
+        return -1
+    return EXPERIMENTS.index(parts[1]) if parts[1] in EXPERIMENTS else len(EXPERIMENTS)
 
 
 def why_not_within_jaxnew(module: str, name: str) -> str | None:
@@ -231,9 +246,12 @@ def test_actions_needs_numpy_only() -> None:
         ("envs_host/x.py", "from jaxnew import ActionSplit", "host workers"),
         ("envs_host/x.py", "from jaxnew.environment import Action", "host workers"),
         ("envs_host/x.py", 'import importlib\nimportlib.import_module("jax")', "host workers"),
-        ("examples/x.py", "from experiments._flags import load_task", "needs jaxnew only"),
+        ("examples/x.py", "from experiments.pipeline.flags import load_task", "needs jaxnew only"),
         ("examples/x.py", "from envs_mjx.grid_world import GridWorld", "needs jaxnew only"),
         ("experiments/x.py", "from examples.kicks import TASK", "by its place"),
+        ("experiments/pipeline/x.py", "from experiments.reports import plots", "is layered"),
+        ("experiments/reports/x.py", "from experiments import train", "knows no command"),
+        ("experiments/tasks/x.py", "import experiments.pipeline.flags", "is layered"),
         ("jaxnew/task.py", "import examples", "no simulator"),
         ("envs_host/create/x.py", "from ...jaxnew.environment import A", "host workers"),
     ],
@@ -260,6 +278,8 @@ def test_each_rule_is_broken_by_an_example(
         ("jaxnew/ppo/x.py", "from jaxnew.rollout import batch\nfrom .learner import Learner"),
         ("jaxnew/evaluation.py", "import jaxnew.ppo\nfrom jaxnew import _files, metrics"),
         ("experiments/x.py", "import brax, envs_host, envs_mjx.grid_world, jaxnew.loop"),
+        ("experiments/x.py", "from experiments import figures\nimport experiments.reports.plots"),
+        ("experiments/reports/x.py", "from experiments.pipeline import flags\nimport experiments"),
     ],
 )
 def test_what_the_design_allows_is_allowed(tmp_path: Path, path: str, line: str) -> None:

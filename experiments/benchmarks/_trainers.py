@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments._artifacts import Domain
-from experiments._flags import load_task
-from experiments._training import TrainConfig, Trainer
 from experiments.benchmarks import _measure as m
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import load_task
+from experiments.pipeline.training import TrainConfig, Trainer
 from jaxnew.ppo import TrainState
 from jaxnew.ppo.objective import Minibatch
 from jaxnew.representation.table import RepresentationTable

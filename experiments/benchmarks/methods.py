@@ -15,11 +15,11 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments._methods import VARIANTS
-from experiments._training import Trainer
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
 from experiments.benchmarks.training import CountedSets
+from experiments.pipeline.methods import VARIANTS
+from experiments.pipeline.training import Trainer
 from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.ppo import TrainState
 

@@ -30,9 +30,9 @@ from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.polyhedra import Polyhedron, prism, pyramid
 from envs_mjx.shape_stacking.scene import Solver
 from envs_mjx.shape_stacking.solids import DOME_AXIS_HEIGHT, solids
-from experiments import _stacking as stacking
 from experiments import stacking_figures as figures
 from experiments.benchmarks import _measure as m
+from experiments.untrained import towers as stacking
 from jaxnew._provenance import describe_session
 
 WORLDS = flags.DEFINE_integer("worlds", 6, "Worlds of each stage of random play.", lower_bound=1)

@@ -27,8 +27,8 @@ from envs_mjx.shape_stacking.engines._mujoco_pool import world_model
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.rules import Bodies
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
-from experiments import _stacking as stacking
 from experiments.benchmarks import _measure as m
+from experiments.untrained import towers as stacking
 
 ENGINES = flags.DEFINE_list("engines", ["mujoco", "mjx"], "Which engines.")
 MJX_WORLDS = flags.DEFINE_list("mjx_worlds", ["1", "20", "60"], "Worlds per call of MJX.")

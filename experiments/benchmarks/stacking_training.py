@@ -20,9 +20,9 @@ import numpy as np
 
 from envs_mjx.shape_stacking import ShapeStacking
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _flags as flag
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
+from experiments.pipeline import flags as flag
 from jaxnew.policy import distribution_and_value
 
 _REPRESENTATION_SIZE = 128  # Of the HVAE (spec method 3).

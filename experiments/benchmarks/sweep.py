@@ -10,9 +10,9 @@ from typing import Any
 
 import jax
 
-from experiments._training import Trainer
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
+from experiments.pipeline.training import Trainer
 from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
 

@@ -19,9 +19,9 @@ import optax
 from flax import struct
 
 from envs_mjx.grid_world import GridWorld, GridWorldParams, GridWorldState
-from experiments._training import Trainer
 from experiments.benchmarks import _floor, _trainers
 from experiments.benchmarks import _measure as m
+from experiments.pipeline.training import Trainer
 from jaxnew import sampling
 from jaxnew.environment import Action, Transition
 from jaxnew.policy import Categorical, UtilityMethod

@@ -13,9 +13,9 @@ import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
-from experiments._training import Trainer
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
+from experiments.pipeline.training import Trainer
 from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
 from jaxnew.policy.utility import Utility

@@ -15,7 +15,7 @@ from envs_mjx.shape_stacking import rules, scene, shape_library
 from envs_mjx.shape_stacking.engines import _limits, mujoco_c
 from envs_mjx.shape_stacking.engines._mujoco_pool import world_model
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _stacking as stacking
+from experiments.untrained import towers as stacking
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
 

@@ -25,8 +25,8 @@ from envs_mjx.shape_stacking.engines import (
 )
 from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _stacking as stacking
 from experiments import stacking_figures as figures
+from experiments.untrained import towers as stacking
 
 pytestmark = pytest.mark.optimized
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from examples.kicks import PLAY
-from experiments._artifacts import load_encoder
+from experiments.pipeline.artifacts import load_encoder
 from tests.experiments.commands import ROOT, read_json, run
 
 PAGES = sorted(ROOT.glob("docs/*.md"))

@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 from envs_mjx.grid_world import skill_universe
-from experiments._artifacts import SPLIT_FILE, TABLE_FILE
-from experiments._evaluation import file_stem
-from experiments._flags import budget_of
-from experiments._runs import Group, group_runs, read_runs
+from experiments.pipeline.artifacts import SPLIT_FILE, TABLE_FILE
+from experiments.pipeline.evaluation import file_stem
+from experiments.pipeline.flags import budget_of
+from experiments.reports.runs import Group, group_runs, read_runs
 from experiments.tasks.grid_world import TASK
 from jaxnew import config as config_lib
 from jaxnew.actions import ActionSplit

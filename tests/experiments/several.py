@@ -114,7 +114,7 @@ def _forget_flags() -> None:
 
 
 def _read_by_user(command: Any, job: list[str]) -> str:
-    from experiments._flags import run_command
+    from experiments.pipeline.flags import run_command
 
     _forget_flags()
     sys.argv = [command.__name__, *job]
@@ -135,7 +135,7 @@ def _read_by_user(command: Any, job: list[str]) -> str:
 def _output(command: Any, job: list[str], around: Any) -> str:
     from absl import flags
 
-    from experiments._flags import configure_jax
+    from experiments.pipeline.flags import configure_jax
 
     _forget_flags()
     flags.FLAGS(["command", *job])

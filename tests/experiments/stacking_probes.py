@@ -21,8 +21,8 @@ import numpy as np
 
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _training
-from experiments._machinery import machinery_of
+from experiments.pipeline import training
+from experiments.pipeline.machinery import machinery_of
 from jaxnew.evaluation import Evaluator
 
 EPISODES = 4
@@ -55,7 +55,7 @@ def watched(job: list[str]) -> Iterator[None]:
     with (
         mock.patch.object(MujocoC, "settle_host", _noting),
         mock.patch.object(Evaluator, "_play_sampled", property(_play)),
-        mock.patch.object(_training, "machinery_of", _shared),
+        mock.patch.object(training, "machinery_of", _shared),
     ):
         yield
     found = {"placed": sorted(_placed), "batches": sorted(_batches)}

@@ -9,9 +9,9 @@ from functools import partial
 import jax
 import numpy as np
 
-from experiments._artifacts import Domain
-from experiments._flags import load_task
-from experiments._training import TrainConfig, Trainer
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import load_task
+from experiments.pipeline.training import TrainConfig, Trainer
 from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import engineered_table

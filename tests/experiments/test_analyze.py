@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments._artifacts import load_encoder
-from experiments._flags import UsageError
-from experiments._plots import Metric
-from experiments._searches import batch_size_sources
-from experiments._studies import STUDIES, encoded_test_actions
-from experiments._study_report import Study, StudyPoint, as_markdown, study_figure
-from experiments._training import load_trainer
+from experiments.pipeline.artifacts import load_encoder
+from experiments.pipeline.flags import UsageError
+from experiments.pipeline.training import load_trainer
+from experiments.reports.plots import Metric
+from experiments.reports.searches import batch_size_sources
+from experiments.reports.studies import STUDIES, encoded_test_actions
+from experiments.reports.study_report import Study, StudyPoint, as_markdown, study_figure
 from experiments.tasks.grid_world import TASK
 from jaxnew import observations
 from jaxnew.actions import ActionSplit

@@ -14,15 +14,15 @@ import pytest
 from envs_mjx.recommender import product_universe
 from envs_mjx.shape_stacking import ShapeStacking, shape_library
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _stacking_anchors as stacking
-from experiments._anchors import Anchors, anchors_of, lines_of, markdown, notes_of
-from experiments._artifacts import Domain
-from experiments._flags import UsageError, load_task
-from experiments._recommender_anchors import rates
-from experiments._runs import Group, read_runs
-from experiments._stacking_anchors import StackingAnchor
-from experiments._training import EVALUATION_SEED
 from experiments.anchors import stack
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.training import EVALUATION_SEED
+from experiments.reports.anchors import Anchors, anchors_of, lines_of, markdown, notes_of
+from experiments.reports.runs import Group, read_runs
+from experiments.untrained import stacking
+from experiments.untrained.recommender import rates
+from experiments.untrained.stacking import StackingAnchor
 from jaxnew import config as config_lib
 from jaxnew.policy import Categorical
 from jaxnew.sampling import AvailableSet

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import skill_universe
-from experiments._artifacts import Domain, find_table
-from experiments._flags import load_task
+from experiments.pipeline.artifacts import Domain, find_table
+from experiments.pipeline.flags import load_task
 from jaxnew import observations
 from jaxnew.actions import SplitMismatch
 from jaxnew.representation.table import RepresentationTable

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._flags import load_task
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import load_task
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
@@ -273,7 +273,7 @@ def checkpoint_arrays(path: Path, kind: str) -> list[bytes]:
     """The bits of a checkpoint's state, read back by the code that `evaluate` uses."""
     import jax
 
-    from experiments._training import load_state, load_trainer
+    from experiments.pipeline.training import load_state, load_trainer
 
     run_directory, trainer, _ = load_trainer(path)
     state, step = load_state(run_directory, trainer, kind)

@@ -12,15 +12,15 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from experiments import _drawing, _finetuning, _paper_figures, _studies
-from experiments._artifacts import Domain
-from experiments._figure_list import FIGURES
-from experiments._flags import UsageError, load_task
-from experiments._jobs import announce, embed_job, training_jobs
-from experiments._paper import paper_value
-from experiments._production import Cell, Source, find
-from experiments._runs import Group, read_runs
-from experiments._study_report import Study, StudyPoint, as_csv, as_markdown, study_figure
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.reports import drawing, finetuning, paper_figures, studies
+from experiments.reports.figure_list import FIGURES
+from experiments.reports.jobs import announce, embed_job, training_jobs
+from experiments.reports.paper import paper_value
+from experiments.reports.production import Cell, Source, find
+from experiments.reports.runs import Group, read_runs
+from experiments.reports.study_report import Study, StudyPoint, as_csv, as_markdown, study_figure
 from experiments.tasks.create import LEVELS
 from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable, engineered_table
@@ -202,23 +202,23 @@ def test_three_tasks_share_an_encoder(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_what_a_figure_lacks_is_counted(tmp_path: Path) -> None:
     source = source_of("create-push", tmp_path, seeds=(1,))
-    settings = _paper_figures.settings_of(FIGURES["20"], source)
-    jobs = _paper_figures.unique_jobs(_paper_figures.missing_jobs(FIGURES["20"], settings))
+    settings = paper_figures.settings_of(FIGURES["20"], source)
+    jobs = paper_figures.unique_jobs(paper_figures.missing_jobs(FIGURES["20"], settings))
     assert [job.command[0] for job in jobs] == ["embed", "train", "train"]
-    assert _paper_figures.missing_episodes(FIGURES["20"], settings, 100) == 400
+    assert paper_figures.missing_episodes(FIGURES["20"], settings, 100) == 400
     write_evaluation(finished(source, NO_SUBGOALS), "test", 0.5, set_size=5)
-    assert _paper_figures.missing_episodes(FIGURES["20"], settings, 100) == 300
-    settings = _paper_figures.settings_of(FIGURES["9c"], source)
-    assert _paper_figures.missing_episodes(FIGURES["9c"], settings, 100) == 500
+    assert paper_figures.missing_episodes(FIGURES["20"], settings, 100) == 300
+    settings = paper_figures.settings_of(FIGURES["9c"], source)
+    assert paper_figures.missing_episodes(FIGURES["9c"], settings, 100) == 500
     path = finished(source, settings[0][1])
     write_evaluation(path, "mix-0.2", 0.5, set_size=5)
     write_evaluation(path, "mix-0.4", 0.5, set_size=50)
-    assert _paper_figures.missing_episodes(FIGURES["9c"], settings, 100) == 400
+    assert paper_figures.missing_episodes(FIGURES["9c"], settings, 100) == 400
     (run,) = read_runs([path])
     task = settings[0][0].domain.task
-    assert _studies.lacking_values("mix", run, task, 100) == [0.0, 0.4, 0.6, 0.8]
-    assert len(_studies.lacking_values("mix", run, task, 1001)) == 5
-    films = _paper_figures.settings_of(FIGURES["8"], source_of("create-push", seeds=(3, 4)))
+    assert studies.lacking_values("mix", run, task, 100) == [0.0, 0.4, 0.6, 0.8]
+    assert len(studies.lacking_values("mix", run, task, 1001)) == 5
+    films = paper_figures.settings_of(FIGURES["8"], source_of("create-push", seeds=(3, 4)))
     assert films[0][0].seeds == (3,)
 
 
@@ -291,7 +291,7 @@ def test_bars_are_the_evaluations(
     tmp_path: Path, number: str, labels: list[str], papers: list[float]
 ) -> None:
     source = source_of("create-push", tmp_path)
-    settings = _paper_figures.settings_of(FIGURES[number], source)
+    settings = paper_figures.settings_of(FIGURES[number], source)
     means = iter(np.arange(1, 17) / 32)
     expected = []
     for _, cell in settings:
@@ -302,7 +302,7 @@ def test_bars_are_the_evaluations(
                 write_evaluation(finished(source, cell, seed), split, mean, set_size=5)
     values = SimpleNamespace(episodes=1000, pdf=False)
     figure = FIGURES[number]
-    picture, text, table = _paper_figures.draw(number, figure, settings, tmp_path, values)
+    picture, text, table = paper_figures.draw(number, figure, settings, tmp_path, values)
     with table.open() as file:
         rows = list(csv.DictReader(file))
     assert list(dict.fromkeys(row["setting"] for row in rows)) == labels
@@ -319,7 +319,7 @@ def test_curves_of_the_paper_are_those_of_the_default_setting(tmp_path: Path) ->
     source = source_of("create-push", tmp_path)
 
     def curves(cell: Cell) -> tuple[bool, str]:
-        found, label = _drawing._paper_curves(group_of(source, cell))
+        found, label = drawing._paper_curves(group_of(source, cell))
         return bool(found), label
 
     assert curves(OURS) == (True, "paper, ours")
@@ -337,7 +337,7 @@ def test_the_whole_test_set_has_the_no_op(tmp_path: Path) -> None:
     write_evaluation(path, "test", 0.6, set_size=5)
     write_evaluation(path, "test", 0.7, set_size=507)
     group = Group("ours", source.domain.task, tuple(read_runs([path])))
-    lines = [(r.label, r.mean) for r in _finetuning._references(source, group, 1000)]
+    lines = [(r.label, r.mean) for r in finetuning._references(source, group, 1000)]
     # Experiments spec 8.
     assert lines == [
         ("ours, zero-shot, sets as in training (5)", 0.6),
@@ -364,11 +364,11 @@ def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> N
     source = source_of("create-obstacle", tmp_path)
     analysed = Cell("ours", "hvae-oracle", variant="-analysis")
     group = group_of(source, analysed)
-    kind = _studies._kind_of(study, group.task)
-    points = {value: _studies.paper_point(kind, group, value) for value in kind.values(group.task)}
+    kind = studies._kind_of(study, group.task)
+    points = {value: studies.paper_point(kind, group, value) for value in kind.values(group.task)}
     assert [100 * points[value].mean for value in sorted(points)] == pytest.approx(means, abs=0.06)
     assert {point.num_seeds for point in points.values()} == {5}
-    assert _studies.paper_point(kind, group, 0.123) is None
+    assert studies.paper_point(kind, group, 0.123) is None
     for cell in (
         Cell("no-entropy", "hvae-oracle", variant="-analysis"),
         replace(analysed, conditions_position=True),
@@ -376,33 +376,33 @@ def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> N
     ):
         other = group_of(source, cell)
         value = kind.values(other.task)[0]
-        kind_of_other = _studies._kind_of(study, other.task)
-        assert _studies.paper_point(kind_of_other, other, value) is None, cell
+        kind_of_other = studies._kind_of(study, other.task)
+        assert studies.paper_point(kind_of_other, other, value) is None, cell
 
 
 @pytest.mark.golden
 def test_points_of_the_set_sizes(tmp_path: Path) -> None:
-    kind = _studies.STUDIES["set-size"]
+    kind = studies.STUDIES["set-size"]
     source = source_of("create-push", tmp_path)
     # Experiments spec 17: 10 and 60 actions.
     for method, first, last in (("ours", 45.3, 81.8), ("no-subsampling", 23.1, 41.0)):
         group = group_of(source, Cell(method, "hvae"))
-        means = [100 * _studies.paper_point(kind, group, size).mean for size in (10, 60)]
+        means = [100 * studies.paper_point(kind, group, size).mean for size in (10, 60)]
         assert means == pytest.approx([first, last], abs=0.06)
-    assert _studies.paper_point(kind, group, 12) is None
-    assert _studies.paper_point(kind, group_of(source, FULL), 10) is None
+    assert studies.paper_point(kind, group, 12) is None
+    assert studies.paper_point(kind, group_of(source, FULL), 10) is None
 
 
 @pytest.mark.unit
 def test_a_study_shows_the_papers_points_beside_their_setting() -> None:
-    value = _studies.PaperValue(0.4, 0.05, 5)
+    value = studies.PaperValue(0.4, 0.05, 5)
     points = (
         StudyPoint("a", 2.0, np.array([0.125, 0.375]), 100, value),
         StudyPoint("a", 1.0, np.array([0.5, 0.5]), 100),
         StudyPoint("b", 2.0, np.array([0.6, 0.6]), 100),
         StudyPoint("b", 1.0, np.array([0.7, 0.7]), 100),
     )
-    metric = _drawing.plots.Metric.of("is_success")
+    metric = drawing.plots.Metric.of("is_success")
     study = Study("angle", "angle", False, metric, points, "Note.", "9a", "CREATE Push")
     lines = as_markdown(study).splitlines()
     assert lines[0] == "# Figure 9a, CREATE Push: angle: success rate (%)"
@@ -439,8 +439,8 @@ def test_held_out_tools_of_two_splits(tmp_path: Path, monkeypatch: pytest.Monkey
         RepresentationTable(np.ascontiguousarray(rows), ids, source=name).save(given[name])
     given["hvae@full"] = tmp_path / "full.npz"
     engineered_table(universe, "gt32").save(given["hvae@full"])
-    settings = _paper_figures.settings_of(FIGURES["15"], replace(source, given=given))
-    panels = _paper_figures.representation_panels(settings)
+    settings = paper_figures.settings_of(FIGURES["15"], replace(source, given=given))
+    panels = paper_figures.representation_panels(settings)
     assert [(name, d.split_name) for name, (d, _) in panels.items()] == [
         ("hvae", "default"),
         ("vae", "default"),
@@ -449,9 +449,9 @@ def test_held_out_tools_of_two_splits(tmp_path: Path, monkeypatch: pytest.Monkey
     ]
     drawn = []
     monkeypatch.setattr(
-        _drawing.report, "tsne", lambda rows, seed: drawn.append(len(rows)) or rows[:, :2]
+        drawing.report, "tsne", lambda rows, seed: drawn.append(len(rows)) or rows[:, :2]
     )
-    figure = _drawing.representations_figure(panels, "Figure 15")
+    figure = drawing.representations_figure(panels, "Figure 15")
 
     def purity(table: np.ndarray, domain: Domain) -> float:
         """Share of the five nearest others that are of an action's class, mean over actions."""
@@ -482,12 +482,12 @@ def test_the_legend_is_not_wider_than_the_picture() -> None:
     names = domain.universe.class_names
     labels = np.unique(domain.universe.class_labels[domain.split.test])
     points = np.column_stack([labels, labels]).astype(float)
-    figure = _drawing.plots.tsne_scatter([_drawing.Scatter(points, labels)] * 2, names)
+    figure = drawing.plots.tsne_scatter([drawing.Scatter(points, labels)] * 2, names)
     figure.canvas.draw()
     (legend,) = figure.legends
     extent = legend.get_window_extent()
     assert 0.5 * figure.bbox.width < extent.width < figure.bbox.width
-    assert _drawing.plots.amount(96.0) == "96 steps"
+    assert drawing.plots.amount(96.0) == "96 steps"
 
 
 @pytest.mark.unit

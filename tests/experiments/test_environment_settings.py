@@ -9,10 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._flags import UsageError, load_task
-from experiments._machinery import with_environment_settings
-from experiments._training import TrainConfig, Trainer
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.machinery import with_environment_settings
+from experiments.pipeline.training import TrainConfig, Trainer
 from jaxnew import config as config_lib
 from jaxnew.config import ConfigError
 from jaxnew.representation.table import RepresentationTable

@@ -18,12 +18,15 @@ from matplotlib.colors import to_rgb
 from PIL import Image
 
 from envs_mjx.grid_world import skill_universe
-from experiments import _drawing, _episode, figures
-from experiments._curves import CurveSetting, RunCurve, learning_curves, mean_curve
-from experiments._episode import Episode, choose, episode_animation, play_episodes
-from experiments._flags import UsageError
-from experiments._paper import PaperCurve, paper_value
-from experiments._plots import (
+from experiments import figures
+from experiments.pipeline.flags import UsageError
+from experiments.pipeline.training import TrainConfig, Trainer
+from experiments.reports import drawing
+from experiments.reports import episode as _episode
+from experiments.reports.curves import CurveSetting, RunCurve, learning_curves, mean_curve
+from experiments.reports.episode import Episode, choose, episode_animation, play_episodes
+from experiments.reports.paper import PaperCurve, paper_value
+from experiments.reports.plots import (
     Bar,
     BarSetting,
     Metric,
@@ -33,9 +36,8 @@ from experiments._plots import (
     save,
     tsne_scatter,
 )
-from experiments._results import as_markdown, result_rows
-from experiments._runs import read_runs
-from experiments._training import TrainConfig, Trainer
+from experiments.reports.results import as_markdown, result_rows
+from experiments.reports.runs import read_runs
 from experiments.tasks.grid_world import TASK
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.ppo import TrainState
@@ -380,7 +382,7 @@ def test_colours_are_the_papers_and_never_shared(tmp_path: Path) -> None:
         plain_config(representation="gt12"),
     ]
     paths = [write_run(tmp_path / f"{i}", config) for i, config in enumerate(configs)]
-    colors = _drawing.setting_colors(groups_at(*paths))
+    colors = drawing.setting_colors(groups_at(*paths))
     assert colors[0] == hls_palette(10)[3]
     assert colors[3] == hls_palette(10)[4]
     assert len(set(colors)) == 4
@@ -389,7 +391,7 @@ def test_colours_are_the_papers_and_never_shared(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_learning_curve_of_a_run_in_environment_steps(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run", plain_config(representation="hvae"))
-    figure = _drawing.curves_figure(groups_at(path))
+    figure = drawing.curves_figure(groups_at(path))
     assert figure is not None
     raw, held = (line for line in figure.axes[1].lines if line.get_label().startswith("ours,"))
     # Evaluated after 2, 4 and 6 updates of 256 steps; below a million the axis is in thousands.
@@ -400,11 +402,11 @@ def test_learning_curve_of_a_run_in_environment_steps(tmp_path: Path) -> None:
     assert labels[-1] == "paper, ours, held at best (mean ± std over seeds)"
     # The paper has no curve for engineered vectors: its default stands in, under its own name.
     engineered = write_run(tmp_path / "gt12", plain_config())
-    figure = _drawing.curves_figure(groups_at(engineered))
+    figure = drawing.curves_figure(groups_at(engineered))
     assert figure is not None
     assert legend_texts(figure)[-1].startswith("paper, ours on HVAE (none for gt12), held")
     untrained = write_run(tmp_path / "none", plain_config(seed=5), curve=())
-    assert _drawing.curves_figure(groups_at(untrained)) is None
+    assert drawing.curves_figure(groups_at(untrained)) is None
 
 
 @pytest.mark.unit
@@ -417,7 +419,7 @@ def test_bars_of_runs_beside_the_papers(tmp_path: Path) -> None:
         write_evaluation(path, "test", mean)
     groups = groups_at(*paths)
     rows = {group.label: result_rows(group) for group in groups}
-    figure = _drawing.bars_figure(groups, rows)
+    figure = drawing.bars_figure(groups, rows)
     assert figure is not None
     axes = figure.axes[0]
     # Two seeds, the paper's `ours`, and a setting that the paper does not have.
@@ -435,7 +437,7 @@ def test_bars_of_runs_beside_the_papers(tmp_path: Path) -> None:
         "ours, 95 % interval over episodes (1,000 episodes a bar);",
         "paper, population std over seeds.",
     ]
-    assert _drawing.bars_figure(groups, {label: [] for label in rows}) is None
+    assert drawing.bars_figure(groups, {label: [] for label in rows}) is None
 
 
 @pytest.mark.unit
@@ -448,7 +450,7 @@ def test_tsne_draws_the_actions_of_one_part(
         seen.append(vectors)
         return vectors[:, :2]
 
-    monkeypatch.setattr(_drawing.report, "tsne", first_two)
+    monkeypatch.setattr(drawing.report, "tsne", first_two)
     ids = np.arange(1024, dtype=np.int32)
     # The vector says which action it is; quadrants lie apart, so that every neighbour is a friend.
     labels = skill_universe().class_labels
@@ -459,7 +461,7 @@ def test_tsne_draws_the_actions_of_one_part(
     held_out = np.sort(np.concatenate([split.validation, split.test]))
     parts = {"heldout": held_out, "train": split.train, "all": ids}
     for part, members in parts.items():
-        figure = _drawing.tsne_figure(run, part)
+        figure = drawing.tsne_figure(run, part)
         assert figure is not None
         drawn = (seen[-1][:, 0] % 1e4).astype(int)
         assert len(drawn) == 400
@@ -471,7 +473,7 @@ def test_tsne_draws_the_actions_of_one_part(
             x = np.asarray(points.get_offsets())[:, 0]
             assert x.tolist() == seen[-1][labels[drawn] == label, 0].tolist()
     assert legend_texts(figure) == list(skill_universe().class_names)
-    _drawing.tsne_figure(run, "all")
+    drawing.tsne_figure(run, "all")
     assert np.array_equal(seen[-1], seen[-2])  # The seed of the run chooses.
 
 
@@ -482,7 +484,7 @@ def test_tsne_draws_the_actions_of_one_part(
 def test_figures_of_run_directories(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
+    monkeypatch.setattr(drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
     paths = [write_run(tmp_path / f"run {seed}", plain_config(seed=seed)) for seed in (1, 2)]
     write_evaluation(paths[0], "train", 0.9)
     write_evaluation(paths[1], "train", 0.8)
@@ -508,7 +510,7 @@ def test_figures_of_run_directories(
 def test_nothing_evaluated_leaves_out_the_bars_and_says_so(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
+    monkeypatch.setattr(drawing.report, "tsne", lambda vectors, seed: vectors[:, :2])
     run = write_run(tmp_path / "run", plain_config(), curve=())
     files = figures.make_figures([run], run / "figures")
     assert [file.name for file in files][:2] == ["results.md", "results.csv"]
@@ -528,7 +530,7 @@ def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
     }
     run = write_run(tmp_path / "embed", config)
     files = commands.run("figures", f"--run={run}").split()
-    assert files == [str(run / "figures" / f"tsne_{part}.png") for part in _drawing.TSNE_PARTS]
+    assert files == [str(run / "figures" / f"tsne_{part}.png") for part in drawing.TSNE_PARTS]
     assert all(Image.open(file).size == (920, 960) for file in files)
 
 

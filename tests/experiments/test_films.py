@@ -23,17 +23,17 @@ from PIL import Image
 from envs_host.create.films import episode_frames
 from envs_host.create.hosting import CreateHost
 from envs_host.create.illustration import RenderOptions
-from experiments import _films, _jobs, _paper_figures
-from experiments._artifacts import Domain
-from experiments._figure_list import FIGURES, PaperFigure
-from experiments._films import Still, film_run
-from experiments._flags import UsageError, load_task
-from experiments._host_episodes import HostEpisode, check_film, play_host_episodes
-from experiments._plots import Metric
-from experiments._production import Cell, Source, find
-from experiments._runs import read_runs
-from experiments._searches import GRIDS, chosen, search_parts
-from experiments._training import EVALUATION_SEED, TrainConfig, Trainer, save_inputs
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.training import EVALUATION_SEED, TrainConfig, Trainer, save_inputs
+from experiments.reports import films, jobs, paper_figures
+from experiments.reports.figure_list import FIGURES, PaperFigure
+from experiments.reports.films import Still, film_run
+from experiments.reports.host_episodes import HostEpisode, check_film, play_host_episodes
+from experiments.reports.plots import Metric
+from experiments.reports.production import Cell, Source, find
+from experiments.reports.runs import read_runs
+from experiments.reports.searches import GRIDS, chosen, search_parts
 from jaxnew import config as config_lib
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.metrics import MetricsLog
@@ -98,7 +98,7 @@ def test_films_are_sorted_by_the_outcome_that_they_show(toy: Any, tmp_path: Path
     files = film_run(path, tmp_path / "figure_8", 40, size=16, title="Toy", num_workers=1)
     assert [file.name for file in files[:2]] == ["figure_8.png", "figure_8.csv"]
     assert not old.exists()
-    state, _ = _films.load_state(RunDirectory.load(path), trainer, "best")
+    state, _ = films.load_state(RunDirectory.load(path), trainer, "best")
     key = jax.random.key(EVALUATION_SEED)
     expected = trainer.evaluator.run(
         state.params, None, trainer.table, trainer.pools["test"], key, 40
@@ -127,7 +127,7 @@ def test_films_are_sorted_by_the_outcome_that_they_show(toy: Any, tmp_path: Path
 def test_episodes_inside_jit_are_drawn_from_their_states(tmp_path: Path) -> None:
     path, trainer = untrained(tmp_path / "run", "grid_world", "gt12")
     film_run(path, tmp_path / "out", 12, size=90, title="Grid")
-    state, _ = _films.load_state(RunDirectory.load(path), trainer, "best")
+    state, _ = films.load_state(RunDirectory.load(path), trainer, "best")
     arguments = state.params, state.rollout.observation_statistics, trainer.table
     key = jax.random.key(EVALUATION_SEED)
     expected = trainer.evaluator.run(*arguments, trainer.pools["test"], key, 12)
@@ -169,7 +169,7 @@ def test_a_sheet_names_every_episode() -> None:
         Still(number, number == 1, 0.0, np.full((8, 8, 3), 20 * number, np.uint8))
         for number in range(7)
     ]
-    figure = _films.sheet(stills, "Figure 8")
+    figure = films.sheet(stills, "Figure 8")
     assert figure.get_suptitle() == "Figure 8 (1 of 7 successful)"
     shown = [(axes.get_title(), axes.images[0].get_array()[0, 0, 0]) for axes in figure.axes[:7]]
     assert shown[1] == ("episode 1: success", 20)
@@ -185,7 +185,7 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
         Still(number, value >= 1.5, value, np.full((8, 8, 3), 20 * number, np.uint8))
         for number, value in enumerate(values)
     ]
-    figure = _films.ranked_sheet(stills, Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    figure = films.ranked_sheet(stills, Metric.of("final_height"), "at least 1.5 m", "Figure 8")
     title = "Figure 8, best and worst of 12 (7 of 12 at least 1.5 m)"
     assert figure.get_suptitle() == title
     shown = [(a.get_xlabel(), int(a.images[0].get_array()[0, 0, 0]) // 20) for a in figure.axes]
@@ -197,7 +197,7 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
     colors = [axes.xaxis.label.get_color() for axes in figure.axes]
     assert len(set(colors[:5])) == len(set(colors[5:])) == 1
     assert colors[0] != colors[5]
-    few = _films.ranked_sheet(stills[:3], Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    few = films.ranked_sheet(stills[:3], Metric.of("final_height"), "at least 1.5 m", "Figure 8")
     assert few.get_suptitle() == "Figure 8 (1 of 3 at least 1.5 m)"
     assert [axes.get_xlabel()[:5] for axes in few.axes[:3]] == ["3.250", "1.000", "0.500"]
 
@@ -206,7 +206,7 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
 def test_films_of_create_are_those_of_the_level(tmp_path: Path) -> None:
     path, trainer = untrained(tmp_path / "run", "create-push", "gt32")
     with closing(trainer):
-        state, _ = _films.load_state(RunDirectory.load(path), trainer, "best")
+        state, _ = films.load_state(RunDirectory.load(path), trainer, "best")
         (episode,) = play_host_episodes(trainer, state, "test", 1)
     film_run(path, tmp_path / "out", 1, size=24, num_workers=1)
     with (tmp_path / "out.csv").open() as file:
@@ -235,21 +235,21 @@ def test_films_of_create_are_those_of_the_level(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_which_run_is_filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     made: list[Any] = []
-    monkeypatch.setattr(_paper_figures, "film_run", lambda *given: made.append(given) or [])
+    monkeypatch.setattr(paper_figures, "film_run", lambda *given: made.append(given) or [])
     config = {**plain_config(), "task": "create-push", "representation": "hvae"}
     path = write_run(tmp_path / "run", config)
     values = SimpleNamespace(run=[str(path)], out=None, films=3, film_size=64)
     values.film_format, values.film_pages = "mp4", True
     with flagged(task="create-push"):
-        _paper_figures.film_given(values)
+        paper_figures.film_given(values)
         title = "Figure 8, CREATE Push: ours, hvae"
         assert made == [(path, path / "figures" / "figure_8", 3, 64, ".mp4", title, 0, True)]
         values.run *= 2
         with pytest.raises(UsageError, match="Figure 8 shows one run; 2 were given"):
-            _paper_figures.film_given(values)
+            paper_figures.film_given(values)
     values.run = [str(path)]
     with flagged(task="create-seesaw"), pytest.raises(UsageError, match="of task create-seesaw"):
-        _paper_figures.film_given(values)
+        paper_figures.film_given(values)
     shop = untrained(tmp_path / "shop", "recommender", "product")[0]
     with pytest.raises(UsageError, match="Episodes of task recommender cannot be filmed"):
         film_run(shop, tmp_path / "out", 1)
@@ -281,7 +281,7 @@ def source_of_toy(folder: Path) -> tuple[Any, ...]:
     return domain, folder, "smoke", "smoke", 0.0, (1,), (), {}
 
 
-def run_and_kill(job: _jobs.Job, folder: Path) -> None:
+def run_and_kill(job: jobs.Job, folder: Path) -> None:
     """Starts a command, and ends it at its first checkpoint as a power cut would."""
     process = subprocess.Popen([sys.executable, "-m", *job._module, *job.command[1:]], cwd=ROOT)
     while process.poll() is None and not Checkpointer(folder / "checkpoints").steps("latest"):
@@ -312,7 +312,7 @@ def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
         pdf=False,
     )
     with flagged(task=PLACE, budget="smoke", runs=str(tmp_path), workers=1):
-        assert _paper_figures.make(values) == []
+        assert paper_figures.make(values) == []
         planned = capfd.readouterr().out
         assert planned.count("python -m experiments.train") == 1  # Both figures need it.
         assert "30 episodes of evaluation" in planned  # 2 bars and 3 points.
@@ -320,16 +320,16 @@ def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
         values.dry_run = False
         run = tmp_path / "toy" / "ours-gt4-default-smoke-4-1"
         with monkeypatch.context() as killed:
-            killed.setattr(_jobs.Job, "run", lambda job: run_and_kill(job, run))
+            killed.setattr(jobs.Job, "run", lambda job: run_and_kill(job, run))
             with pytest.raises(UsageError, match="Stopped"):
-                _paper_figures.make(values)
+                paper_figures.make(values)
         assert Checkpointer(run / "checkpoints").steps("latest")[-1] < 4
         assert not find(Source(*source_of_toy(tmp_path)), TOY)
-        files = _paper_figures.make(values)
+        files = paper_figures.make(values)
         assert "resuming" in capfd.readouterr().out
         before = {file: file.stat().st_mtime_ns for file in run.rglob("*.json*")}
-        monkeypatch.setattr(_jobs.Job, "run", lambda job: pytest.fail(job.text))
-        assert _paper_figures.make(values) == files
+        monkeypatch.setattr(jobs.Job, "run", lambda job: pytest.fail(job.text))
+        assert paper_figures.make(values) == files
         assert before == {file: file.stat().st_mtime_ns for file in run.rglob("*.json*")}
         assert "All runs and evaluations are there" in capfd.readouterr().out
     assert [file.name for file in files] == [

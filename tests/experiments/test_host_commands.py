@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments._training import load_state, load_trainer
+from experiments.pipeline.training import load_state, load_trainer
 from jaxnew import metrics
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.task import Task

@@ -8,8 +8,8 @@ from typing import Any
 import jax
 import pytest
 
-from experiments._flags import load_task
-from experiments._machinery import machinery_of
+from experiments.pipeline.flags import load_task
+from experiments.pipeline.machinery import machinery_of
 
 
 @pytest.mark.unit

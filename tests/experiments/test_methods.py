@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._flags import UsageError, load_task
-from experiments._methods import VARIANTS, adapted, trained_ids, variant_of
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew import metrics
 from tests.experiments.commands import OPTIMIZED, read_json, run
 from tests.experiments.several import run_several

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from experiments._paper import (
+from experiments.reports.paper import (
     PaperError,
     paper_curve,
     paper_environments,

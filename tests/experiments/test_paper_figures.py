@@ -17,18 +17,18 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import skill_universe
-from experiments import _finetuning, _jobs
-from experiments._artifacts import Domain
-from experiments._comparison import compare_curves, comparison_markdown, verdict_of
-from experiments._figure_list import number_of
-from experiments._finetuning import finetune_budget, finetune_folder, make_finetuned
-from experiments._flags import UsageError
-from experiments._jobs import Job, duration, sweep_job
-from experiments._paper import paper_curve, paper_set_size, paper_value
-from experiments._paper_figures import lacking_splits, parse_given
-from experiments._production import Cell, Source, find
-from experiments._results import result_rows
-from experiments._runs import read_runs
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError
+from experiments.reports import finetuning, jobs
+from experiments.reports.comparison import compare_curves, comparison_markdown, verdict_of
+from experiments.reports.figure_list import number_of
+from experiments.reports.finetuning import finetune_budget, finetune_folder, make_finetuned
+from experiments.reports.jobs import Job, duration, sweep_job
+from experiments.reports.paper import paper_curve, paper_set_size, paper_value
+from experiments.reports.paper_figures import lacking_splits, parse_given
+from experiments.reports.production import Cell, Source, find
+from experiments.reports.results import result_rows
+from experiments.reports.runs import read_runs
 from experiments.tasks.grid_world import TASK
 from jaxnew import config as config_lib
 from jaxnew.metrics import MetricsLog
@@ -122,7 +122,7 @@ def test_what_is_missing_becomes_a_command_with_its_duration(tmp_path: Path) -> 
 
 @pytest.mark.unit
 def test_a_command_that_fails_ends_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(_jobs.sys, "executable", "/bin/false")
+    monkeypatch.setattr(jobs.sys, "executable", "/bin/false")
     with pytest.raises(UsageError, match="ended with status 1: python -m"):
         Job("it", ("sweep", "--x"), "seconds", None).run()
 
@@ -215,7 +215,7 @@ def test_fine_tuning_is_drawn_from_its_runs(
 ) -> None:
     source = source_at(tmp_path, seeds=(1,))
     made = []
-    monkeypatch.setattr(_finetuning.Job, "run", lambda job: made.append(job.command))
+    monkeypatch.setattr(finetuning.Job, "run", lambda job: made.append(job.command))
     paths = []
     for method in ("ours", "nearest-neighbour"):
         paths.append(finished(tmp_path / method, run_config(method)))
@@ -245,7 +245,7 @@ def test_fine_tuning_is_drawn_from_its_runs(
         ("ours, zero-shot, all at once (256)", 0.8),
         ("paper, zero-shot, all at once", whole.mean),
     ]
-    figure = _finetuning.finetune_figure(content, "title")
+    figure = finetuning.finetune_figure(content, "title")
     heights = [float(line.get_ydata()[0]) for line in figure.axes[0].lines]
     assert heights[:4] == [50.0, 25.0, 50.0, 25.0]
     assert heights[4] == 70.0

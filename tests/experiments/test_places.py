@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._flags import UsageError, load_task
-from experiments._jobs import embed_job, sweep_job
-from experiments._methods import adapted, file_name, method_of, variant_of
-from experiments._production import Cell, Source
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.methods import adapted, file_name, method_of, variant_of
+from experiments.reports.jobs import embed_job, sweep_job
+from experiments.reports.production import Cell, Source
 from jaxnew.policy import UtilityMethod
 
 pytestmark = pytest.mark.unit

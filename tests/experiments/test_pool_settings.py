@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from envs_host.pool import PoolSettings
-from experiments._flags import UsageError, load_task
-from experiments._machinery import pool_assignments, with_pool_settings
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.machinery import pool_assignments, with_pool_settings
 from jaxnew.config import ConfigError
 from jaxnew.task import HostDomain, Task
 from tests.toy_task import TASK as TOY

@@ -14,8 +14,8 @@ import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
 from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
-from experiments._artifacts import REPRESENTATION_SEED
-from experiments._training import load_trainer
+from experiments.pipeline.artifacts import REPRESENTATION_SEED
+from experiments.pipeline.training import load_trainer
 from jaxnew import metrics
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable

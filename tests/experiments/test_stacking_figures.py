@@ -7,10 +7,10 @@ import pytest
 
 from envs_mjx.shape_stacking import shape_library
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import _stacking as stacking
 from experiments import stacking_figures as figures
-from experiments._stacking import SETTLE_ONLY, Row
 from experiments.stacking_figures import Start
+from experiments.untrained import towers as stacking
+from experiments.untrained.towers import SETTLE_ONLY, Row
 
 # Cubes, a hat, a sphere, a rectangle, plates; the largest flat ones are 719, 659, 605.
 ACTION_SET = np.array([660, 690, 719, 80, 735, 594, 659, 605, *range(400, 412)])

@@ -17,15 +17,17 @@ from envs_mjx.shape_stacking import ShapeStacking, films
 from envs_mjx.shape_stacking.camera import task_camera
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments import _comparison, _drawing, _films, _finetuning, _paper_figures, figures
-from experiments._episode import is_success
-from experiments._figure_list import FIGURES, number_of
-from experiments._flags import load_task
-from experiments._paper import paper_curve, paper_method, paper_value
-from experiments._production import Cell, find
-from experiments._results import result_rows
-from experiments._runs import Group, read_runs
-from experiments._training import load_trainer
+from experiments import figures
+from experiments.pipeline.flags import load_task
+from experiments.pipeline.training import load_trainer
+from experiments.reports import comparison, drawing, finetuning, paper_figures
+from experiments.reports import films as film_reports
+from experiments.reports.episode import is_success
+from experiments.reports.figure_list import FIGURES, number_of
+from experiments.reports.paper import paper_curve, paper_method, paper_value
+from experiments.reports.production import Cell, find
+from experiments.reports.results import result_rows
+from experiments.reports.runs import Group, read_runs
 from jaxnew.representation.table import RepresentationTable, engineered_table
 from tests.experiments.handwritten import write_evaluation, write_run
 from tests.experiments.test_anchors import write_anchors
@@ -77,8 +79,8 @@ def test_figures_that_show_stacking() -> None:
 @pytest.mark.unit
 def test_the_variants_share_an_encoder_and_have_sweeps_of_their_own(tmp_path: Path) -> None:
     source = source_of(TASK, tmp_path)
-    settings = _paper_figures.settings_of(FIGURES["23"], source)
-    jobs = _paper_figures.unique_jobs(_paper_figures.missing_jobs(FIGURES["23"], settings))
+    settings = paper_figures.settings_of(FIGURES["23"], source)
+    jobs = paper_figures.unique_jobs(paper_figures.missing_jobs(FIGURES["23"], settings))
     kinds = [job.command[0] for job in jobs]
     assert kinds == ["embed", "embed", *["sweep"] * 4]
     assert {job.command[1] for job in jobs[:2]} == {"--task=shape_stacking"}
@@ -90,9 +92,9 @@ def test_the_variants_share_an_encoder_and_have_sweeps_of_their_own(tmp_path: Pa
     assert folders[0].endswith("/shape_stacking/sweep-ours-hvae-smoke-2-1-2")
     assert folders[1].endswith("/shape_stacking-no-place/sweep-ours-hvae-smoke-2-1-2")
     assert folders[3].endswith("/shape_stacking/sweep-ours-hvae-full-smoke-2-1-2")
-    assert _paper_figures.missing_episodes(FIGURES["23"], settings, 100) == 4 * 2 * 2 * 100
+    assert paper_figures.missing_episodes(FIGURES["23"], settings, 100) == 4 * 2 * 2 * 100
     write_evaluation(finished(source, NO_PLACE), "test", 1.0, HEIGHT, set_size=5)
-    assert _paper_figures.missing_episodes(FIGURES["23"], settings, 100) == 1500
+    assert paper_figures.missing_episodes(FIGURES["23"], settings, 100) == 1500
     found = {cell: find(source.of(cell), cell) for cell in (OURS, NO_PLACE, SQUARE, FULL)}
     assert [len(runs) for runs in found.values()] == [0, 1, 0, 0]
 
@@ -149,7 +151,7 @@ def test_every_curve_of_figure_24_is_the_papers(tmp_path: Path) -> None:
     source = source_of(TASK, tmp_path)
     for cell in FIGURES["24"].cells[TASK]:
         group = group_of(source, cell)
-        curves, label = _drawing._paper_curves(group)
+        curves, label = drawing._paper_curves(group)
         assert label == f"paper, {group.paper_method}"
         assert set(curves) == {"train", "validation"}
 
@@ -172,7 +174,7 @@ def test_figures_find_runs_of_their_own_environment_only(tmp_path: Path) -> None
     source = replace(plain, assignments=(kept, "pool.max_restarts=3", "num_updates=7"))
     assert source.budget_of("ours").num_updates == 7
     assert source.budget_assignments == ["num_updates=7"]
-    job = _finetuning.finetune_job(source, tmp_path, "ours", 1, "warm", 0)
+    job = finetuning.finetune_job(source, tmp_path, "ours", 1, "warm", 0)
     assert [word for word in job.command if word.startswith("--set")] == [
         "--set=num_updates=7",
         f"--set=num_updates={math.ceil(7 * source.domain.task.baselines.finetune_share)}",
@@ -185,7 +187,7 @@ def test_learning_curves_stand_beside_the_papers(tmp_path: Path) -> None:
     source = source_of(TASK, tmp_path, budget="paper")
     # 244 updates of 4,096 steps are a third of 3 million.
     group = group_of(source, OURS, curve=(1.5, 2.4, 2.1), updates=244)
-    picture, text, table = _paper_figures.draw_curves("figure_24", "Curves", [group], tmp_path)
+    picture, text, table = paper_figures.draw_curves("figure_24", "Curves", [group], tmp_path)
     with table.open() as file:
         rows = list(csv.DictReader(file))
     train = {round(float(r["steps"]), -4): r for r in rows if r["split"] == "train"}
@@ -209,13 +211,13 @@ def test_train_curves_of_another_simulator_are_not_compared(tmp_path: Path) -> N
     cells = (OURS, Cell("nearest-neighbour", "hvae"), Cell("no-subsampling", "hvae"))
     groups = [group_of(source, cell, curve=(1.5, 2.4, 2.1), updates=244) for cell in cells]
     for group in groups:
-        points = [p for p in _comparison.compare_curves([group]) if p.paper_mean is not None]
+        points = [p for p in comparison.compare_curves([group]) if p.paper_mean is not None]
         assert {p.split for p in points} == {"train", "validation"}
         for point in points:
             is_fair = group is groups[0] or point.split == "validation"
             assert (point.verdict is not None) == is_fair
     note = FIGURES["24"].notes[TASK]
-    _, text, _ = _paper_figures.draw_curves("f", "Curves", groups, tmp_path, note=note)
+    _, text, _ = paper_figures.draw_curves("f", "Curves", groups, tmp_path, note=note)
     assert text.read_text().rstrip().endswith(note)
 
 
@@ -226,7 +228,7 @@ def test_zero_shot_lines_of_fine_tuning(tmp_path: Path) -> None:
     write_evaluation(path, "test", 1.5, HEIGHT, set_size=5)
     write_evaluation(path, "test", 1.75, HEIGHT, set_size=203)
     group = Group("ours", source.domain.task, tuple(read_runs([path])))
-    lines = [(r.label, r.mean) for r in _finetuning._references(source, group, 1000)]
+    lines = [(r.label, r.mean) for r in finetuning._references(source, group, 1000)]
     # Experiments spec 8.
     assert lines == [
         ("ours, zero-shot, sets as in training (5)", 1.5),
@@ -242,7 +244,7 @@ def test_zero_shot_lines_of_fine_tuning(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_bars_of_figure_23_with_anchors(tmp_path: Path) -> None:
     source = source_of(TASK, tmp_path)
-    settings = _paper_figures.settings_of(FIGURES["23"], source)
+    settings = paper_figures.settings_of(FIGURES["23"], source)
     means = iter(np.arange(1, 17) / 8)
     expected, groups = [], []
     for own, cell in settings:
@@ -251,14 +253,14 @@ def test_bars_of_figure_23_with_anchors(tmp_path: Path) -> None:
             expected.append(np.mean(both))
             for seed, mean in zip(source.seeds, both, strict=True):
                 write_evaluation(finished(source, cell, seed), split, mean, HEIGHT, set_size=5)
-        groups.append(_paper_figures.group_of(own, cell))
+        groups.append(paper_figures.group_of(own, cell))
     for number, task in enumerate((TASK, f"{TASK}-no-place")):
         write_anchors(tmp_path / task / "anchors", 0.25 * (1 + number), task=task)
     write_anchors(tmp_path / TASK / "anchors", 0.75, split="full")
     for file in tmp_path.rglob("anchors/*.json"):  # Runs at smoke budget have smaller sets.
         file.write_text(file.read_text().replace('"set_size": 20', '"set_size": 5'))
     values = SimpleNamespace(episodes=1000, pdf=False)
-    drawn = _paper_figures.draw("23", FIGURES["23"], settings, tmp_path, values)
+    drawn = paper_figures.draw("23", FIGURES["23"], settings, tmp_path, values)
     picture, text, table = drawn
     with table.open() as file:
         rows = list(csv.DictReader(file))
@@ -279,7 +281,7 @@ def test_bars_of_figure_23_with_anchors(tmp_path: Path) -> None:
     table, _ = figures.write_table(groups, of_groups, tmp_path, ["A note."])
     assert table.read_text().count("Policies without training, shape_stacking") == 3
     assert "A note." in table.read_text()
-    figure = _drawing.bars_figure(groups, of_groups, "t")
+    figure = drawing.bars_figure(groups, of_groups, "t")
     (axes,) = figure.axes
     lines = [
         (float(np.mean(line.get_xdata())), float(line.get_ydata()[0]))
@@ -295,7 +297,7 @@ def test_bars_of_figure_23_with_anchors(tmp_path: Path) -> None:
 @pytest.mark.unit
 def test_bars_of_fixed_sets_leave_the_axis_as_it_is(tmp_path: Path) -> None:
     source = source_of(TASK, tmp_path, seeds=(1,))
-    settings = _paper_figures.settings_of(FIGURES["6"], source)
+    settings = paper_figures.settings_of(FIGURES["6"], source)
     for _, cell in settings:
         path = finished(source, cell)
         is_fixed = cell.method == "no-subsampling"
@@ -303,10 +305,10 @@ def test_bars_of_fixed_sets_leave_the_axis_as_it_is(tmp_path: Path) -> None:
         write_evaluation(path, "train", 2.0, HEIGHT, **size)
         write_evaluation(path, "test", 1.0, HEIGHT, set_size=5)
     values = SimpleNamespace(episodes=1000, pdf=False)
-    _, text, _ = _paper_figures.draw("6", FIGURES["6"], settings, tmp_path, values)
+    _, text, _ = paper_figures.draw("6", FIGURES["6"], settings, tmp_path, values)
     assert "another simulator" in text.read_text()
-    groups = [_paper_figures.group_of(own, cell) for own, cell in settings]
-    figure = _drawing.bars_figure(groups, {g.label: result_rows(g) for g in groups})
+    groups = [paper_figures.group_of(own, cell) for own, cell in settings]
+    figure = drawing.bars_figure(groups, {g.label: result_rows(g) for g in groups})
     assert figure.axes[0].get_ylim()[1] == 2.75
     assert "7.239 ↑" in [text.get_text() for text in figure.axes[0].texts]
 
@@ -324,16 +326,16 @@ def test_held_out_shapes_of_two_splits(tmp_path: Path, monkeypatch: pytest.Monke
         if name == "vae":
             table = RepresentationTable(noise, ids, source=name)
         table.save(given[name])
-    settings = _paper_figures.settings_of(FIGURES["16"], replace(source, given=given))
-    assert _paper_figures.missing_jobs(FIGURES["16"], settings) == []
-    panels = _paper_figures.representation_panels(settings)
+    settings = paper_figures.settings_of(FIGURES["16"], replace(source, given=given))
+    assert paper_figures.missing_jobs(FIGURES["16"], settings) == []
+    panels = paper_figures.representation_panels(settings)
     assert [(name, d.split_name) for name, (d, _) in panels.items()] == [
         ("hvae", "default"),
         ("vae", "default"),
         ("hvae, split full", "full"),
     ]
-    monkeypatch.setattr(_drawing.report, "tsne", lambda rows, seed: rows[:, :2])
-    drawn = [_drawing.tsne_panel(d, t, "heldout", 31, name) for name, (d, t) in panels.items()]
+    monkeypatch.setattr(drawing.report, "tsne", lambda rows, seed: rows[:, :2])
+    drawn = [drawing.tsne_panel(d, t, "heldout", 31, name) for name, (d, t) in panels.items()]
     # Spec 9: 405 and 390 are held out, of the Full split 8 classes.
     assert ["of 405 actions" in panel.subtitle for panel in drawn] == [True, True, False]
     full = {CLASS_NAMES[label] for label in drawn[2].labels}
@@ -344,7 +346,7 @@ def test_held_out_shapes_of_two_splits(tmp_path: Path, monkeypatch: pytest.Monke
     assert len(np.unique(drawn[0].labels)) == 16
     purity = [float(panel.subtitle.split("purity ")[1].split()[0]) for panel in drawn]
     assert purity[0] > 0.9 > 0.3 > purity[1]  # The engineered vectors hold the class.
-    figure = _drawing.representations_figure(panels, "Figure 16: held-out shapes")
+    figure = drawing.representations_figure(panels, "Figure 16: held-out shapes")
     (legend,) = figure.legends
     assert [text.get_text() for text in legend.get_texts()] == list(CLASS_NAMES)
 
@@ -376,11 +378,11 @@ def test_films_of_towers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         played.extend(_episode_play(*given))
         return played
 
-    _episode_play = _films.play_episodes
-    monkeypatch.setattr(_films, "load_trainer", load)
-    monkeypatch.setattr(_films, "play_episodes", play)
+    _episode_play = film_reports.play_episodes
+    monkeypatch.setattr(film_reports, "load_trainer", load)
+    monkeypatch.setattr(film_reports, "play_episodes", play)
     out = tmp_path / "figure_8"
-    files = _films.film_run(path, out, 2, size=40, title="Towers", with_pages=True)
+    files = film_reports.film_run(path, out, 2, size=40, title="Towers", with_pages=True)
     assert [file.name for file in files[:2]] == ["figure_8.png", "figure_8.csv"]
     with files[1].open() as file:
         rows = list(csv.DictReader(file))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from experiments._flags import load_task
+from experiments.pipeline.flags import load_task
 
 TASK = load_task("shape_stacking")
 

@@ -9,9 +9,9 @@ import sys
 
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._flags import UsageError, load_task
-from experiments._training import TrainConfig
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.training import TrainConfig
 from experiments.sweep import member_configs, parse_seeds
 from jaxnew.representation.table import engineered_table
 from tests.experiments.commands import OPTIMIZED, ROOT

@@ -10,10 +10,10 @@ import jax
 import numpy as np
 import pytest
 
-from experiments._artifacts import Domain
-from experiments._evaluation import evaluate_on
-from experiments._flags import load_task
-from experiments._training import TrainConfig, Trainer
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.evaluation import evaluate_on
+from experiments.pipeline.flags import load_task
+from experiments.pipeline.training import TrainConfig, Trainer
 from jaxnew.representation.table import engineered_table
 from jaxnew.sampling import ActionPool, draw_sets
 from jaxnew.task import Task

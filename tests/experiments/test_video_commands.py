@@ -12,14 +12,14 @@ import pytest
 
 from envs_host.create.play import PlayConfig, record_images
 from envs_host.create.recorder import Recorder
-from experiments._artifacts import (
+from experiments.pipeline.artifacts import (
     REPRESENTATION_SEED,
     Domain,
     parse_representation,
     train_representation,
 )
-from experiments._flags import UsageError, load_task
-from experiments._recordings import collect
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.pipeline.recordings import collect
 from jaxnew import metrics, observations
 from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.sources import DrawnRecordings, StoredRecordings

@@ -11,7 +11,7 @@ import pytest
 from PIL import Image
 
 from experiments import contact_sheets
-from experiments._video import write_video
+from experiments.reports.video import write_video
 
 
 def frames(count: int, height: int = 15, width: int = 20) -> list[np.ndarray]:

@@ -18,13 +18,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments import _plots as plots
-from experiments._episode import play_episodes
-from experiments._flags import UsageError
-from experiments._host_episodes import check_film, play_host_episodes
-from experiments._plots import Metric
-from experiments._training import Trainer, load_state, load_trainer
-from experiments._video import write_video
+from experiments.pipeline.flags import UsageError
+from experiments.pipeline.training import Trainer, load_state, load_trainer
+from experiments.reports import plots
+from experiments.reports.episode import play_episodes
+from experiments.reports.host_episodes import check_film, play_host_episodes
+from experiments.reports.plots import Metric
+from experiments.reports.video import write_video
 from jaxnew.ppo import TrainState
 from jaxnew.task import Filming, MakeFilm
 

@@ -9,12 +9,13 @@ from typing import Any
 
 from absl import flags
 
-from experiments import _flags as flag
-from experiments import _plots as plots
-from experiments._anchors import notes_of
-from experiments._artifacts import TABLE_FILE, Domain, find_table
-from experiments._comparison import compare_curves, comparison_csv, comparison_markdown
-from experiments._drawing import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import TABLE_FILE, Domain, find_table
+from experiments.pipeline.evaluation import evaluate_run
+from experiments.reports import plots
+from experiments.reports.anchors import notes_of
+from experiments.reports.comparison import compare_curves, comparison_csv, comparison_markdown
+from experiments.reports.drawing import (
     BAR_SPLITS,
     bars_figure,
     curves_figure,
@@ -22,16 +23,15 @@ from experiments._drawing import (
     representations_figure,
     standard_rows,
 )
-from experiments._evaluation import evaluate_run
-from experiments._figure_list import FIGURES, PaperFigure, number_of
-from experiments._films import film_run
-from experiments._finetuning import finetune_figure, finetune_seconds, make_finetuned
-from experiments._jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
-from experiments._production import Cell, Source, find
-from experiments._results import ResultRow, as_csv, as_markdown, result_rows
-from experiments._runs import Group, Run, group_runs, read_runs
-from experiments._studies import lacking_values, study_runs
-from experiments._study_report import write_study
+from experiments.reports.figure_list import FIGURES, PaperFigure, number_of
+from experiments.reports.films import film_run
+from experiments.reports.finetuning import finetune_figure, finetune_seconds, make_finetuned
+from experiments.reports.jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
+from experiments.reports.production import Cell, Source, find
+from experiments.reports.results import ResultRow, as_csv, as_markdown, result_rows
+from experiments.reports.runs import Group, Run, group_runs, read_runs
+from experiments.reports.studies import lacking_values, study_runs
+from experiments.reports.study_report import write_study
 from jaxnew.representation.table import RepresentationTable
 
 Setting = tuple[Source, Cell]  # A cell, and where its runs come from.

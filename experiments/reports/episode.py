@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
+from experiments.pipeline.training import EVALUATION_SEED, Trainer, load_state, load_trainer
 from jaxnew.environment import Action
 from jaxnew.ppo import TrainState
 from jaxnew.sampling import ActionPool, draw_sets

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments._flags import UsageError, load_place
+from experiments.pipeline.flags import UsageError, load_place
 from jaxnew.actions import ActionSplit
 from jaxnew.environment import ActionSpec
 from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method

@@ -16,11 +16,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments._artifacts import TABLE_FILE, parse_representation
-from experiments._flags import UsageError
-from experiments._methods import file_name
-from experiments._plots import amount
-from experiments._production import Cell, Source
+from experiments.pipeline.artifacts import TABLE_FILE, parse_representation
+from experiments.pipeline.flags import UsageError
+from experiments.pipeline.methods import file_name
+from experiments.reports.plots import amount
+from experiments.reports.production import Cell, Source
 from jaxnew.cores import available_cores
 from jaxnew.task import StageTwoBudget
 

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments._paper import PaperValue, paper_steps, paper_value
-from experiments._plots import Metric
-from experiments._runs import Group, Run
+from experiments.reports.paper import PaperValue, paper_steps, paper_value
+from experiments.reports.plots import Metric
+from experiments.reports.runs import Group, Run
 from jaxnew.actions import SPLIT_NAMES
 
 RANDOM_PLAY = "random-play"  # What `demo` records in place of a checkpoint.

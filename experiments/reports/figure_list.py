@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from experiments import _flags as flag
-from experiments._production import Cell
+from experiments.pipeline import flags as flag
+from experiments.reports.production import Cell
 
 _BASELINES = ("ours", "continuous", "nearest-neighbour")
 _ABLATIONS = ("ours", "no-entropy", "no-subsampling")

@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
-from experiments import _flags as flag
-from experiments._artifacts import Domain
-from experiments._jobs import Job, announce, sweep_job, train_job
-from experiments._methods import file_name
-from experiments._production import Cell, Source
-from experiments._runs import Group, Run, group_runs, read_runs
-from experiments._study_report import Study, StudyPoint
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.methods import file_name
+from experiments.reports.jobs import Job, announce, sweep_job, train_job
+from experiments.reports.production import Cell, Source
+from experiments.reports.runs import Group, Run, group_runs, read_runs
+from experiments.reports.study_report import Study, StudyPoint
 from jaxnew.run_directory import RunDirectoryError
 
 

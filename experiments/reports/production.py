@@ -9,11 +9,11 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from experiments._artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
-from experiments._flags import UsageError, budget_of, load_task
-from experiments._machinery import environment_settings, in_group, pool_assignments
-from experiments._methods import adapted
-from experiments._runs import Run, read_runs
+from experiments.pipeline.artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
+from experiments.pipeline.flags import UsageError, budget_of, load_task
+from experiments.pipeline.machinery import environment_settings, in_group, pool_assignments
+from experiments.pipeline.methods import adapted
+from experiments.reports.runs import Run, read_runs
 from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run_directory import RunDirectoryError

@@ -89,7 +89,7 @@ def load_task(name: str) -> Task:
     Raises:
       UsageError: there is no such module or object, or it is not a `Task`.
     """
-    known = sorted(path.stem for path in (Path(__file__).parent / "tasks").glob("[a-z]*.py"))
+    known = sorted(path.stem for path in (Path(__file__).parents[1] / "tasks").glob("[a-z]*.py"))
     allowed = f"Tasks: {', '.join(known)}; or give package.module:TASK for one of your own."
     is_place = ":" in name
     module, _, variant = ("", "", "") if is_place else name.partition("-")

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments._training import EVALUATION_SEED, Trainer
+from experiments.pipeline.training import EVALUATION_SEED, Trainer
 from jaxnew.ppo import TrainState
 from jaxnew.rollout.pool import HostEnvironments, HostPool, HostStep
 from jaxnew.task import Film

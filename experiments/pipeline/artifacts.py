@@ -10,8 +10,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from experiments._flags import UsageError, budget_of
-from experiments._recordings import Recordings, collect
+from experiments.pipeline.flags import UsageError, budget_of
+from experiments.pipeline.recordings import Recordings, collect
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit, ActionUniverse
@@ -253,7 +253,7 @@ def load_encoder(path: Path) -> tuple[EmbedConfig, RepresentationLearner, Repres
     Raises:
       RunDirectoryError, CheckpointError: `path` is no such run, or has no readable checkpoint.
     """
-    from experiments._flags import load_task
+    from experiments.pipeline.flags import load_task
 
     run = RunDirectory.load(path)
     config = config_lib.from_dict(EmbedConfig, run.config)

@@ -10,15 +10,15 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import _plots as plots
-from experiments._curves import RunCurve, reference_curves
-from experiments._evaluation import evaluate_run
-from experiments._jobs import Job, duration, training_seconds
-from experiments._methods import trained_ids
-from experiments._paper import paper_value
-from experiments._plots import Color, Metric
-from experiments._production import Source
-from experiments._runs import Group, read_runs
+from experiments.pipeline.evaluation import evaluate_run
+from experiments.pipeline.methods import trained_ids
+from experiments.reports import plots
+from experiments.reports.curves import RunCurve, reference_curves
+from experiments.reports.jobs import Job, duration, training_seconds
+from experiments.reports.paper import paper_value
+from experiments.reports.plots import Color, Metric
+from experiments.reports.production import Source
+from experiments.reports.runs import Group, read_runs
 from jaxnew.task import StageTwoBudget
 
 # Method of the pretrained run -> (what `finetune` trains, name of its two curves).

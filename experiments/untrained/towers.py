@@ -19,6 +19,16 @@ from envs_mjx.shape_stacking.solids import CLASS_NAMES
 # In place of a shape's id: nothing is dropped, but 3 s go by (a repeated shape, a stop).
 SETTLE_ONLY = -1
 
+# Classes that others can stand on.
+FLAT_TOPPED = (
+    "horizontal_rectangle",
+    "arch",
+    "rectangle",
+    "half_rectangle",
+    "cube",
+    "cylinder",
+)
+
 Drop = tuple[int, float]  # Shape's id, or `SETTLE_ONLY`, and x in metres.
 
 

@@ -9,11 +9,11 @@ from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
-from experiments._curves import mean_curve
-from experiments._drawing import CURVE_SPLITS, run_curves
-from experiments._paper import is_comparable, paper_curve
-from experiments._plots import Metric
-from experiments._runs import Group
+from experiments.reports.curves import mean_curve
+from experiments.reports.drawing import CURVE_SPLITS, run_curves
+from experiments.reports.paper import is_comparable, paper_curve
+from experiments.reports.plots import Metric
+from experiments.reports.runs import Group
 
 _SHARES = (0.25, 0.5, 0.75, 1.0)  # Of our steps, at which the curves are compared.
 

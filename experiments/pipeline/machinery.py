@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from experiments._flags import UsageError
+from experiments.pipeline.flags import UsageError
 from jaxnew import config as config_lib
 from jaxnew.evaluation import Evaluator
 from jaxnew.host_evaluation import HostEvaluator

@@ -13,8 +13,8 @@ from matplotlib.legend_handler import HandlerTuple
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
-from experiments._paper import PaperCurve
-from experiments._plots import (
+from experiments.reports.paper import PaperCurve
+from experiments.reports.plots import (
     INK,
     LEGEND,
     PAPER_COLOR,

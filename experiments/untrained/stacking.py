@@ -18,10 +18,10 @@ from envs_mjx.shape_stacking.camera import FRAME_SIZE
 from envs_mjx.shape_stacking.engines import Engine
 from envs_mjx.shape_stacking.rules import Bodies
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments._anchors import Summary
-from experiments._artifacts import Domain
-from experiments._training import EVALUATION_SEED
-from experiments.stacking_figures import FLAT_TOPPED
+from experiments.pipeline.artifacts import Domain
+from experiments.pipeline.training import EVALUATION_SEED
+from experiments.reports.anchors import Summary
+from experiments.untrained.towers import FLAT_TOPPED
 from jaxnew.environment import Action, Transition
 from jaxnew.evaluation import Evaluator, summarize
 from jaxnew.policy import Categorical

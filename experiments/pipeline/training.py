@@ -13,9 +13,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments._artifacts import SPLIT_FILE, TABLE_FILE, Domain
-from experiments._flags import budget_of, load_task
-from experiments._machinery import (
+from experiments.pipeline.artifacts import SPLIT_FILE, TABLE_FILE, Domain
+from experiments.pipeline.flags import budget_of, load_task
+from experiments.pipeline.machinery import (
     DeviceMachinery,
     HostMachinery,
     environment_settings,
@@ -24,7 +24,7 @@ from experiments._machinery import (
     with_environment_settings,
     with_pool_settings,
 )
-from experiments._methods import adapted, file_name, method_of, trained_ids
+from experiments.pipeline.methods import adapted, file_name, method_of, trained_ids
 from jaxnew import config as config_lib
 from jaxnew import loop
 from jaxnew.actions import ActionSplit

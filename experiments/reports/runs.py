@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from experiments._artifacts import SPLIT_FILE, TABLE_FILE
-from experiments._flags import UsageError, load_task
-from experiments._paper import (
+from experiments.pipeline.artifacts import SPLIT_FILE, TABLE_FILE
+from experiments.pipeline.flags import UsageError, load_task
+from experiments.reports.paper import (
     paper_environment,
     paper_figure_of_split,
     paper_method,
     paper_results,
     paper_set_size,
 )
-from experiments._plots import Metric
+from experiments.reports.plots import Metric
 from jaxnew.actions import ActionSplit
 from jaxnew.config import differences
 from jaxnew.metrics import read

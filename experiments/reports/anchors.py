@@ -8,9 +8,9 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments._flags import UsageError
-from experiments._plots import Metric
-from experiments._runs import Group
+from experiments.pipeline.flags import UsageError
+from experiments.reports.plots import Metric
+from experiments.reports.runs import Group
 
 FOLDER = "anchors"  # Beside the runs of the task.
 

@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-FOLDER = Path(__file__).parent / "paper"
+FOLDER = Path(__file__).parents[1] / "paper"
 
 # Environment steps of a training run (experiments spec 2).
 _BUDGETS = {

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.recommender import Recommender, RecommenderParams, RecommenderState
-from experiments._artifacts import Domain
+from experiments.pipeline.artifacts import Domain
 from jaxnew.environment import Action, Transition
 from jaxnew.evaluation import Evaluator, summarize
 from jaxnew.policy import Categorical

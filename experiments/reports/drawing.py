@@ -8,15 +8,15 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import _flags as flag
-from experiments import _plots as plots
-from experiments._anchors import lines_of
-from experiments._artifacts import REPRESENTATION_SEED, Domain
-from experiments._curves import CurveSetting, RunCurve, learning_curves
-from experiments._paper import PaperCurve, paper_curve, paper_method
-from experiments._plots import Bar, BarSetting, Color, Scatter
-from experiments._results import ResultRow
-from experiments._runs import Group, Run
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import REPRESENTATION_SEED, Domain
+from experiments.reports import plots
+from experiments.reports.anchors import lines_of
+from experiments.reports.curves import CurveSetting, RunCurve, learning_curves
+from experiments.reports.paper import PaperCurve, paper_curve, paper_method
+from experiments.reports.plots import Bar, BarSetting, Color, Scatter
+from experiments.reports.results import ResultRow
+from experiments.reports.runs import Group, Run
 from jaxnew.representation import report
 from jaxnew.representation.table import RepresentationTable
 

@@ -12,7 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments._training import EVALUATION_SEED, Trainer, load_state, load_trainer
+from experiments.pipeline.training import EVALUATION_SEED, Trainer, load_state, load_trainer
 from jaxnew.actions import ActionSplit
 from jaxnew.evaluation import summarize
 from jaxnew.ppo import TrainState

@@ -11,18 +11,18 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import _flags as flag
-from experiments._artifacts import (
+from experiments.pipeline import flags as flag
+from experiments.pipeline.artifacts import (
     Domain,
     collect_observations,
     load_encoder,
     parse_representation,
 )
-from experiments._evaluation import evaluate_on, record
-from experiments._paper import PaperValue, paper_method, paper_results
-from experiments._runs import Group, Run, group_runs, read_runs
-from experiments._study_report import Study, StudyPoint
-from experiments._training import Trainer, load_state, load_trainer
+from experiments.pipeline.evaluation import evaluate_on, record
+from experiments.pipeline.training import Trainer, load_state, load_trainer
+from experiments.reports.paper import PaperValue, paper_method, paper_results
+from experiments.reports.runs import Group, Run, group_runs, read_runs
+from experiments.reports.study_report import Study, StudyPoint
 from jaxnew.actions import ActionSplit, mixture_ids
 from jaxnew.task import Task
 

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments import _plots as plots
-from experiments._paper import PaperValue
-from experiments._plots import Metric
+from experiments.reports import plots
+from experiments.reports.paper import PaperValue
+from experiments.reports.plots import Metric
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,1 @@
+"""What is reached without training: anchors of results, and towers from lists of drops."""
