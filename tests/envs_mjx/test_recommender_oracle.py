@@ -17,7 +17,7 @@ from scipy import stats
 from envs_mjx.recommender import Recommender, RecommenderState, environment
 from jaxnew.environment import Action
 
-pytestmark = pytest.mark.oracle
+pytestmark = [pytest.mark.oracle, pytest.mark.optimized]
 
 ENV = Recommender()
 PARAMS = ENV.default_params

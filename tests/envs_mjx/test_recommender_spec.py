@@ -19,7 +19,7 @@ from envs_mjx.recommender.products import product_constants, product_universe, p
 from jaxnew.environment import Action, FixedActionSet
 from jaxnew.sampling import ActionPool, draw_sets
 
-pytestmark = pytest.mark.golden
+pytestmark = [pytest.mark.golden, pytest.mark.optimized]
 
 ENV = Recommender()
 PARAMS = ENV.default_params

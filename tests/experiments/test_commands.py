@@ -166,7 +166,6 @@ def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path
     common = ("--budget=smoke", f"--runs={runs}")
     names = ("hvae-relative", "hvae-onehot-oracle", "vae")
     jobs = [(*common, f"--representation={name}") for name in names]
-    jobs[-1] = (*jobs[-1], "--set=model.actions_per_batch=16")
     outputs = run_several("embed", jobs)
     assert "already complete" in outputs[0]
     numbers = read_json(encoder_run / "evaluation" / "representation.json")

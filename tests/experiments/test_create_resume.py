@@ -121,10 +121,10 @@ def test_a_command_ends_with_the_error_of_the_worker_and_what_to_do() -> None:
     code = (
         "from envs_host._process import Lost\n"
         "from envs_host.pool import WorkerError\n"
-        "from experiments import _flags\n"
+        "from experiments.pipeline import flags\n"
         "def main():\n"
         "    raise WorkerError(1, [2], ((31, (2, 5)),), Lost('was killed by SIGKILL'))\n"
-        "_flags.run_command(main)\n"
+        "flags.run_command(main)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False

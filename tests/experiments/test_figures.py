@@ -22,7 +22,7 @@ from experiments import figures
 from experiments.pipeline.flags import UsageError
 from experiments.pipeline.training import TrainConfig, Trainer
 from experiments.reports import drawing
-from experiments.reports import episode as _episode
+from experiments.reports import episode as episodes
 from experiments.reports.curves import CurveSetting, RunCurve, learning_curves, mean_curve
 from experiments.reports.episode import Episode, choose, episode_animation, play_episodes
 from experiments.reports.paper import PaperCurve, paper_value
@@ -593,7 +593,7 @@ def test_episodes_are_those_of_the_evaluation(trainer: Trainer, untrained: Train
         untrained.rollout.observation_statistics,
         trainer.table,
         trainer.pools["test"],
-        jax.random.key(_episode.EVALUATION_SEED),
+        jax.random.key(episodes.EVALUATION_SEED),
         80,
     )
     assert [e.number for e in played] == list(range(20, 80))

@@ -70,6 +70,7 @@ def multinomial_chi_square(counts: np.ndarray) -> float:
 
 
 @pytest.mark.property
+@pytest.mark.optimized
 @pytest.mark.parametrize("case", CASES)
 def test_members_are_distinct_and_from_the_pool(case: tuple[int, int, int]) -> None:
     in_order = np.sort(draw_numpy(case), axis=1)
