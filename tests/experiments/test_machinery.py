@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import pytest
 
-from experiments.pipeline.flags import load_task
+from experiments.pipeline.flags import UsageError, load_task
 from experiments.pipeline.machinery import machinery_of
 
 
@@ -32,3 +32,10 @@ def test_accelerators_evaluate_as_wide_as_they_train(
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
         method: Any = nobody_asks_it
         assert machinery_of(task, method, config, 0, 0).evaluator.width == width
+
+
+@pytest.mark.unit
+def test_a_task_that_does_not_exist_is_told_those_that_do() -> None:
+    tasks = "Tasks: create, grid_world, recommender, shape_stacking; or give package.module:TASK"
+    with pytest.raises(UsageError, match=tasks):
+        load_task("grid_wrold")
