@@ -98,8 +98,9 @@ def assert_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
     """Checks 3, 4 and 6 to 15.
 
     The spec's figures of three checks are of hulls on hulls in one point, where towers creep
-    (spec 10); those rest as in C with several. In check 12 a sphere is wedged between cylinders,
-    which are 12-gons here.
+    (spec 10); those rest as in C with several, within the 0.02 m that the spec suggests for MJX but
+    for a tower of three cubes. In check 12 a sphere is wedged between cylinders, which are 12-gons
+    here.
     """
     rows = stacking.measured(engine)
     in_c = stacking.measured(c_engine)
@@ -112,11 +113,11 @@ def assert_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
         if not abs(r.value - c.value) <= (2e-4 if r.check == 3 else max(0.01, r.tolerance or 0))
     ]
     assert wrong == []
-    creeping = {7, 13, 15}
+    creeping = {7: 0.02, 13: 0.025, 15: 0.02}
     wrong = [
         (r, c)
         for r, c in asserted
-        if not abs(r.value - float(r.spec)) <= (0.025 if r.check in creeping else r.tolerance or 0)
+        if not abs(r.value - float(r.spec)) <= creeping.get(r.check, r.tolerance or 0)
     ]
     assert wrong == []
     fallen = next(row for row in rows if row.spec == "falls off")
