@@ -9,27 +9,28 @@ from them.
 
 from __future__ import annotations
 
-from pathlib import Path
+from experiments.flags import Arguments
+from jaxnew.embedding import collect, parse_representation
+from jaxnew.task.domain import Domain, load_task
 
-from experiments.pipeline import flags as flag
-from experiments.pipeline.artifacts import Domain, collect_observations, parse_representation
-from experiments.pipeline.stage_one_flags import NUM_RECORDINGS, stores_drawn
+ARGUMENTS = Arguments(
+    __doc__, "task", "representation", "budget", "runs", "observations_per_action", "frames"
+)
 
 
 def main() -> None:
-    task = flag.load_task(flag.TASK.value)
-    domain = Domain.of(task, flag.SPLIT.value)
+    domain = Domain.of(load_task(ARGUMENTS.task))
     play = domain.play
-    if flag.REPRESENTATION.present:
-        play = parse_representation(domain, flag.REPRESENTATION.value).play
-    budget = domain.stage_one(play, flag.BUDGET.value)
-    are_stored = stores_drawn()
-    recordings = collect_observations(
+    if ARGUMENTS.is_given("representation"):
+        play = parse_representation(domain, ARGUMENTS.representation).play
+    budget = domain.stage_one(play, ARGUMENTS.budget)
+    stores_drawn = ARGUMENTS.stores_drawn
+    recordings = collect(
         domain,
-        Path(flag.RUNS.value),
-        NUM_RECORDINGS.value or budget.num_recordings,
+        ARGUMENTS.runs,
+        ARGUMENTS.observations_per_action or budget.num_recordings,
         play,
-        budget.stores_drawn if are_stored is None else are_stored,
+        budget.stores_drawn if stores_drawn is None else stores_drawn,
     )
     for made in (recordings.recorded, recordings.drawn):
         if made is not None:
@@ -40,4 +41,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    flag.run_command(main)
+    ARGUMENTS.start(main)

@@ -11,72 +11,79 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from absl import flags
+from experiments.flags import Arguments
+from jaxnew.embedding import REPRESENTATION_SEED, Encoder, embed
+from jaxnew.observations import Recordings
+from jaxnew.task.places import UsageError
 
-from experiments.pipeline import flags as flag
-from experiments.pipeline.artifacts import (
-    REPRESENTATION_SEED,
-    TABLE_FILE,
-    Domain,
-    load_encoder,
-    print_report,
-    train_representation,
+ARGUMENTS = Arguments(
+    __doc__,
+    "task",
+    "representation",
+    "split",
+    "split_seed",
+    "budget",
+    "seed",
+    "workdir",
+    "runs",
+    "overwrite",
+    "set",
+    "observations_per_action",
+    "frames",
 )
-from experiments.pipeline.stage_one_flags import NUM_RECORDINGS, stores_drawn
-from jaxnew import observations
-from jaxnew.representation.table import RepresentationTable
-
-CHECKPOINT = flags.DEFINE_string("checkpoint", None, "Run directory of a trained encoder.")
-OBSERVATIONS = flags.DEFINE_string("observations", None, ".npz of ids and recordings to encode.")
-OUTPUT = flags.DEFINE_string("output", None, "Where to write the table of the new actions (.npz).")
+ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
+ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
+ARGUMENTS.define("string", "output", None, "Where to write the table of the new actions (.npz).")
 
 
 def main() -> None:
-    given = [f.value is not None for f in (CHECKPOINT, OBSERVATIONS, OUTPUT)]
+    given = [ARGUMENTS.checkpoint, ARGUMENTS.observations, ARGUMENTS.output]
     if all(given):
-        encode_new_actions(Path(CHECKPOINT.value), Path(OBSERVATIONS.value), Path(OUTPUT.value))
+        encode_new_actions(*map(Path, given))
     elif any(given):
-        raise flag.UsageError(
+        raise UsageError(
             "Encoding new actions takes all of --checkpoint, --observations and --output."
         )
     else:
-        train()
-
-
-def train() -> None:
-    """Stage one of the task, and the report on its table."""
-    domain = Domain.of(flag.load_task(flag.TASK.value), flag.SPLIT.value)
-    run = train_representation(
-        domain,
-        Path(flag.RUNS.value),
-        flag.REPRESENTATION.value,
-        flag.BUDGET.value,
-        seed=flag.SEED.value if flag.SEED.present else REPRESENTATION_SEED,
-        assignments=flag.SET.value,
-        workdir=Path(flag.WORKDIR.value) if flag.WORKDIR.value else None,
-        overwrite=flag.OVERWRITE.value,
-        num_recordings=NUM_RECORDINGS.value,
-        stores_drawn=stores_drawn(),
-    )
-    if (run.path / TABLE_FILE).exists():
-        table = RepresentationTable.load(run.path / TABLE_FILE)
-        print_report(domain, run, table)
+        encoder = embed(
+            ARGUMENTS.task,
+            ARGUMENTS.representation,
+            budget=ARGUMENTS.budget,
+            seed=ARGUMENTS.seed if ARGUMENTS.is_given("seed") else REPRESENTATION_SEED,
+            split=ARGUMENTS.split,
+            split_seed=ARGUMENTS.split_seed,
+            set=ARGUMENTS.set,
+            num_recordings=ARGUMENTS.observations_per_action,
+            stores_drawn=ARGUMENTS.stores_drawn,
+            workdir=ARGUMENTS.path,
+            runs=ARGUMENTS.runs,
+            overwrite=ARGUMENTS.overwrite,
+        )
+        if encoder.is_finished:
+            print_report(encoder)
 
 
 def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None:
     """Representations of recorded actions from a frozen encoder."""
-    config, learner, state, play_format = load_encoder(checkpoint)
-    new = observations.load_npz(recordings, play_format)
-    table = RepresentationTable(
-        vectors=learner.encode(state, new.data),
-        ids=new.ids,
-        universe_hash=new.universe_hash,
-        split_hash=config.split_hash,
-        source=f"{config.representation} of {checkpoint}, recordings of {recordings}",
-    )
+    table = Encoder.load(checkpoint).encode(Recordings.load(recordings))
     table.save(output)
     print(f"{output}: {table.vectors.shape[0]} actions, {table.vectors.shape[1]} numbers each.")
 
 
+def print_report(encoder: Encoder) -> None:
+    """Prints purity and linear R2 of a table."""
+    numbers = encoder.report()
+    entries = numbers["entries"]
+    explained = "".join(
+        f"; linear R2 to {name} {value:.2f}" for name, value in numbers["linear_r2_mean"].items()
+    )
+    print(
+        f"{encoder.table.source}: 5-NN purity {numbers['purity_all']:.3f}, held out "
+        f"{numbers['purity_held_out']:.3f}{explained}; {entries['active_dimensions']} of "
+        f"{entries['dimensions']} dimensions vary between actions (std > 0.1). All in "
+        f"{encoder.path / 'evaluation' / 'representation.json'}."
+    )
+
+
 if __name__ == "__main__":
-    flag.run_command(main)
+    ARGUMENTS.start(main)

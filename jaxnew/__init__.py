@@ -8,23 +8,47 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+__version__ = "0.2.0"
+
 _HOMES = {
     "Action": "jaxnew.environment",
-    "ActionObservations": "jaxnew.observations",
     "ActionPool": "jaxnew.sampling",
     "ActionSplit": "jaxnew.actions",
     "ActionUniverse": "jaxnew.actions",
+    "Actions": "jaxnew.sampling",
     "AvailableSet": "jaxnew.sampling",
+    "DeviceRollout": "jaxnew.rollout.device",
+    "Domain": "jaxnew.task.domain",
+    "Encoder": "jaxnew.embedding",
     "Environment": "jaxnew.environment",
-    "Evaluator": "jaxnew.evaluation",
+    "Episode": "jaxnew.rollout.contract",
+    "Evaluation": "jaxnew.run",
     "FixedActionSet": "jaxnew.environment",
+    "HostRollout": "jaxnew.rollout.host",
     "Hyperparameters": "jaxnew.ppo",
     "Learner": "jaxnew.ppo",
+    "MethodContext": "jaxnew.policy.method",
     "PPOConfig": "jaxnew.ppo",
+    "Policy": "jaxnew.rollout.contract",
+    "PolicyMethod": "jaxnew.policy.method",
+    "Recordings": "jaxnew.observations",
+    "RepresentationConfig": "jaxnew.representation.config",
     "RepresentationLearner": "jaxnew.representation.learner",
     "RepresentationTable": "jaxnew.representation.table",
-    "Task": "jaxnew.task",
+    "Rollout": "jaxnew.rollout.contract",
+    "RolloutConfig": "jaxnew.rollout.contract",
+    "Run": "jaxnew.run",
+    "Runs": "jaxnew.sweeping",
+    "Task": "jaxnew.task.task",
+    "Trainer": "jaxnew.trainer",
+    "collect": "jaxnew.embedding",
     "draw_sets": "jaxnew.sampling",
+    "embed": "jaxnew.embedding",
+    "finetune": "jaxnew.training",
+    "load_task": "jaxnew.task.domain",
+    "make_method": "jaxnew.policy.method",
+    "sweep": "jaxnew.sweeping",
+    "train": "jaxnew.training",
 }
 
 __all__ = sorted(_HOMES)
@@ -37,4 +61,4 @@ def __getattr__(name: str) -> Any:
 
 
 def __dir__() -> list[str]:
-    return __all__
+    return [*__all__, "__version__"]

@@ -6,175 +6,108 @@ runs at one width, so an episode is the same however many others are evaluated b
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property, partial
-from typing import Any
+import math
+from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxnew.environment import Environment
-from jaxnew.metrics import mean_interval, wilson_interval
-from jaxnew.policy import PolicyMethod
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, AvailableSet, check_set_size, draw_sets
+from jaxnew.rollout.contract import Episode, Policy, Rollout
+from jaxnew.sampling import Actions
+
+EVALUATION_SEED = 2020  # Shared by all runs, so that they are evaluated on the same episodes.
+_Z_95 = 1.959963984540054
 
 
-@dataclass(frozen=True)
-class Evaluator:
-    """Plays whole episodes with frozen statistics; compiled once per (width, set size, mode).
+def measure(
+    rollout: Rollout,
+    policy: Policy,
+    actions: Actions,
+    num_episodes: int,
+    seed: int = EVALUATION_SEED,
+    is_greedy: bool = False,
+) -> dict[str, np.ndarray]:
+    """Plays episodes `0..num_episodes-1`.
 
-    Attributes:
-      env, env_params: the task, with concrete parameters.
-      method: the policy.
-      set_size: m, actions available in an episode.
-      padded_set_size: width of the sets, 0 for `set_size`.
-      normalize_observations: whether the policy was trained on normalised observations.
-      first_size: actions of the set that are available at the first step, 0 for all of them; then
-        `growth` more become available at every step.
-      width: episodes played at a time.
+    Args:
+      rollout: where.
+      policy: who acts.
+      actions: what sets are drawn from.
+      num_episodes: at least 1.
+      seed: of the episodes.
+      is_greedy: take the most likely action instead of sampling.
+
+    Returns:
+      For each of the rollout's `episode_metrics`, f32[num_episodes] at the episode's end; and
+      `num_steps`, agent steps.
+
+    Raises:
+      ValueError: `num_episodes` < 1.
     """
-
-    env: Environment
-    env_params: Any
-    method: PolicyMethod
-    set_size: int
-    padded_set_size: int = 0
-    normalize_observations: bool = True
-    first_size: int = 0
-    growth: int = 1
-    width: int = 128
-
-    def __post_init__(self) -> None:
-        check_growth(self.first_size, self.growth, self.set_size)
-
-    @property
-    def max_episode_steps(self) -> int:
-        """Length of the longest episode."""
-        return self.env.max_episode_steps(self.env_params)
-
-    def run(
-        self,
-        params: Any,
-        statistics: RunningStatistics,
-        table: jax.Array,
-        pool: ActionPool,
-        key: jax.Array,
-        num_episodes: int,
-        deterministic: bool = False,
-    ) -> dict[str, np.ndarray]:
-        """Plays episodes `0..num_episodes-1`.
-
-        Args:
-          params: of the policy.
-          statistics: of raw observations; not updated.
-          table: f32[A, d] representations.
-          pool: actions that sets are drawn from.
-          key: consumed.
-          num_episodes: at least 1.
-          deterministic: take the most likely action instead of sampling.
-
-        Returns:
-          For each of the environment's `episode_metrics`, f32[num_episodes] at the episode's end;
-          and `num_steps`, agent steps.
-
-        Raises:
-          ValueError: the pool is smaller than a set, or `num_episodes` < 1.
-        """
-        check_set_size(pool, self.set_size)
-        if num_episodes < 1:
-            raise ValueError(f"num_episodes={num_episodes} must be at least 1.")
-        play = self._play_greedy if deterministic else self._play_sampled
-        blocks = []
-        for start in range(0, num_episodes, self.width):
-            block = play(params, statistics, table, pool, key, jnp.int32(start))
-            blocks.append(jax.tree.map(np.asarray, block))
-        return {
-            name: np.concatenate([block[name] for block in blocks])[:num_episodes]
-            for name in blocks[0]
-        }
-
-    def play_block(
-        self,
-        params: Any,
-        statistics: RunningStatistics,
-        table: jax.Array,
-        pool: ActionPool,
-        key: jax.Array,
-        start: jax.Array,
-        deterministic: bool = False,
-    ) -> dict[str, jax.Array]:
-        """Episodes `start..start+width-1`, pure: f32[width] per metric. See `run`."""
-        episodes = start + jnp.arange(self.width)
-        keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(episodes)
-        keys_sets, keys_reset, keys_steps = keys[:, 0], keys[:, 1], keys[:, 2]
-        available = draw_sets(keys_sets, pool, self.set_size, self.padded_set_size or None)
-        obs, state = jax.vmap(self.env.reset_env, in_axes=(0, None))(keys_reset, self.env_params)
-        projected = self.method.project(params, table)[available.ids]
-
-        def step(carry: tuple[Any, ...], t: jax.Array) -> tuple[tuple[Any, ...], None]:
-            obs, state, is_over, metrics = carry
-            if self.normalize_observations:
-                obs = statistics.normalize(obs)
-            now = self._available_at(available, t)
-            distribution = self.method.distribution(params, obs, projected, now.mask)
-            keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys_steps)
-            if deterministic:
-                sample = distribution.mode()
-            else:
-                sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
-            obs, state, _, terminated, truncated, info = jax.vmap(
-                self.env.step_env, in_axes=(0, 0, 0, None)
-            )(keys_now[:, 1], state, self.method.decode(sample, now, table), self.env_params)
-            metrics = {
-                name: jnp.where(is_over, old, self._metric(name, info, t))
-                for name, old in metrics.items()
-            }
-            return (obs, state, is_over | terminated | truncated, metrics), None
-
-        names = (*self.env.episode_metrics, "num_steps")
-        zeros = {name: jnp.zeros(self.width) for name in names}
-        carry = (obs, state, jnp.zeros(self.width, bool), zeros)
-        (_, _, _, metrics), _ = jax.lax.scan(step, carry, jnp.arange(self.max_episode_steps))
-        return metrics
-
-    def _available_at(self, available: AvailableSet, t: jax.Array) -> AvailableSet:
-        """What may be chosen at step `t`: sets are in random order, so a beginning is a set too."""
-        is_there = is_there_at(self.first_size, self.growth, t, available.ids.shape[-1])
-        return AvailableSet(available.ids, available.mask & is_there)
-
-    @staticmethod
-    def _metric(name: str, info: dict[str, jax.Array], t: jax.Array) -> jax.Array:
-        value = t + 1 if name == "num_steps" else info[name]
-        return jnp.asarray(value, jnp.float32)
-
-    @cached_property
-    def _play_sampled(self) -> Any:
-        return jax.jit(self.play_block)
-
-    @cached_property
-    def _play_greedy(self) -> Any:
-        return jax.jit(partial(self.play_block, deterministic=True))
+    if num_episodes < 1:
+        raise ValueError(f"num_episodes={num_episodes} must be at least 1.")
+    return rollout.measure(policy, actions, jax.random.key(seed), num_episodes, is_greedy)
 
 
-def check_growth(first_size: int, growth: int, set_size: int) -> None:
-    """Raises ValueError unless sets can grow so; see `Evaluator`."""
-    if not 0 <= first_size <= set_size or growth < 0:
-        raise ValueError(
-            f"first_size={first_size} must be in 0..{set_size} (the set size) and "
-            f"growth={growth} at least 0."
-        )
+def play(
+    rollout: Rollout,
+    policy: Policy,
+    actions: Actions,
+    first: int,
+    count: int,
+    seed: int = EVALUATION_SEED,
+    is_greedy: bool = False,
+) -> list[Episode]:
+    """Episodes `first..first+count-1` of `measure`, with all that happened in them.
+
+    Raises:
+      ValueError: `first` < 0 or `count` < 1.
+    """
+    if first < 0 or count < 1:
+        raise ValueError(f"first={first} must be at least 0, and count={count} at least 1.")
+    return rollout.episodes(policy, actions, jax.random.key(seed), first, count, is_greedy)
 
 
-def is_there_at(first_size: int, growth: int, t: Any, width: int) -> Any:
-    """bool[..., width] what is there at step t int[...] of a growing set; see `Evaluator`."""
-    t = t[..., None]
-    return (np.arange(width) < first_size + growth * t) | (first_size == 0)
+class Interval(NamedTuple):
+    """An estimate with a 95 % confidence interval."""
+
+    mean: float
+    low: float
+    high: float
+
+
+def wilson_interval(successes: int, trials: int) -> Interval:
+    """Wilson's 95 % score interval for a proportion: inside [0, 1], sound for rare events.
+
+    Raises:
+      ValueError: not 0 <= successes <= trials, or no trial.
+    """
+    from scipy.stats import binomtest
+
+    found = binomtest(successes, trials).proportion_ci(method="wilson")
+    return Interval(successes / trials, float(found.low), float(found.high))
+
+
+def mean_interval(values: np.ndarray) -> Interval:
+    """Mean with its normal 95 % interval, `mean +- 1.96 s / sqrt(n)`; no width for one value.
+
+    Args:
+      values: f[n], n >= 1, independent (episodes of one policy, or one number per seed).
+
+    Raises:
+      ValueError: `values` is not a non-empty vector.
+    """
+    values = np.asarray(values, np.float64)
+    if values.ndim != 1 or values.size == 0:
+        raise ValueError(f"Need a non-empty vector of values, got shape {values.shape}.")
+    mean = float(values.mean())
+    spread = float(values.std(ddof=1)) if values.size > 1 else 0.0
+    half = _Z_95 * spread / math.sqrt(values.size)
+    return Interval(mean, mean - half, mean + half)
 
 
 def summarize(episodes: dict[str, np.ndarray]) -> dict[str, dict[str, float | str]]:
-    """Mean and 95 % interval over episodes of each metric of `Evaluator.run`.
+    """Mean and 95 % interval over episodes of each metric of `measure`.
 
     Metrics of only zeros and ones get a Wilson interval, others a normal one.
     """

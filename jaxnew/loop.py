@@ -9,20 +9,26 @@ steps <= s, and a resumed run removes everything that belongs to later ones.
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import fnmatch
+import math
 import signal
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from jaxnew._progress import ProgressDisplay
-from jaxnew._session import NonFiniteError, Scalars, Session
-from jaxnew.checkpoint import Checkpointer
-from jaxnew.metrics import MetricsLog
-from jaxnew.run_directory import RunDirectory
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnew.storage.checkpoint import Checkpointer, Kind
+from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog
+from jaxnew.storage.progress import ProgressDisplay, duration
+from jaxnew.storage.run_directory import RunDirectory
 
 State = TypeVar("State")
-
-__all__ = ["LoopResult", "NonFiniteError", "run"]
+Scalars = Mapping[str, Any]
 
 
 @dataclass(frozen=True)
@@ -48,37 +54,63 @@ class LoopResult(Generic[State]):
     last_evaluation: dict[str, float] | None
 
 
-def _default_step_of(state: Any) -> int:
-    return int(state.step)
+@dataclass(frozen=True)
+class Rhythm:
+    """When a run does what, in steps of its state.
+
+    Attributes:
+      total_steps: at the end.
+      chunk_steps: per call.
+      checkpoint_every: between `latest` checkpoints.
+      evaluate_every: between evaluations; None: nothing is evaluated.
+
+    Raises:
+      ValueError: one of them is below 1.
+    """
+
+    total_steps: int
+    chunk_steps: int
+    checkpoint_every: int
+    evaluate_every: int | None = None
+
+    def __post_init__(self) -> None:
+        for field in dataclasses.fields(self):
+            value = getattr(self, field.name)
+            if value is not None and value < 1:
+                raise ValueError(f"{field.name} must be at least 1, got {value}.")
 
 
-def _default_finite_part(state: Any) -> Any:
-    return getattr(state, "params", ())
+@dataclass(frozen=True)
+class Display:
+    """What is shown of a run.
+
+    Attributes:
+      title: what runs.
+      unit: what a step is called.
+      work_per_step: e.g. environment steps per update, for the reported rate in `work_unit`.
+      work_unit: see there.
+      metrics: names of those shown beside the progress bar.
+    """
+
+    title: str
+    unit: str = "updates"
+    work_per_step: float | None = None
+    work_unit: str = "env steps"
+    metrics: tuple[str, ...] = ()
 
 
 def run(
     state: State,
-    *,
     chunk: Callable[[State, int], tuple[State, Scalars]],
     run_directory: RunDirectory,
-    total_steps: int,
-    chunk_steps: int,
-    checkpoint_every: int,
-    title: str,
+    rhythm: Rhythm,
+    display: Display,
+    *,
     evaluate: Callable[[State], Scalars] | None = None,
-    evaluate_every: int | None = None,
     selection_metric: str | None = None,
-    on_evaluation: Callable[[int, State, dict[str, float]], None] | None = None,
-    steps_unit: str = "updates",
-    work_per_step: float | None = None,
-    work_unit: str = "env steps",
-    shown_metrics: Sequence[str] = (),
     may_be_nan: Sequence[str] = ("episode/*",),
-    step_of: Callable[[State], int] = _default_step_of,
-    finite_part: Callable[[State], Any] = _default_finite_part,
-    checkpointer: Checkpointer | None = None,
 ) -> LoopResult[State]:
-    """Runs `chunk` until `total_steps`, resuming from the run directory if it holds a checkpoint.
+    """Runs `chunk` until the end, resuming from the run directory if it holds a checkpoint.
 
     Evaluations and checkpoints happen at the end of the first chunk that reaches or passes a
     multiple of their interval, and at the end of the run. A new best evaluation is checkpointed at
@@ -86,35 +118,27 @@ def run(
     which loses only what came after the last checkpoint.
 
     Args:
-      state: freshly initialised pytree at step 0; replaced by the checkpoint when resuming.
+      state: freshly initialised pytree at step 0, replaced by the checkpoint when resuming. Its
+        `step` counts the finished steps; its `params`, if it has any, must be finite to be saved.
       chunk: `(state, n) -> (state, metrics)`: n steps, n static, and scalars reduced over them. It
         sees at most two values of n: `chunk_steps`, and the rest at the end. Random numbers must
         come from the state alone.
       run_directory: open for writing.
-      total_steps, chunk_steps, checkpoint_every: in steps of the state.
-      title: shown by the progress display.
+      rhythm: when to do what.
+      display: what to show.
       evaluate: `state -> {name: float}`; must not change or donate the state and must draw from
         fixed keys.
-      evaluate_every: steps between evaluations; with `evaluate` only.
       selection_metric: name in the evaluation; the highest value wins, the first of equal ones.
-      on_evaluation: called as `(step, state, evaluation)` after the evaluation is recorded. After
-        a crash it may be called again for the same step.
-      steps_unit: what a step is called.
-      work_per_step: e.g. environment steps per update, for the reported rate in `work_unit`.
-      shown_metrics: names shown beside the progress bar.
       may_be_nan: patterns of metric names that are NaN where no episode ended.
-      step_of: the number of finished steps of a state.
-      finite_part: the part of the state that must be finite to be saved; `params` by default.
-      checkpointer: default: one on the run directory's `checkpoints/`.
 
     Raises:
       NonFiniteError: a metric that may not be NaN is not finite, a `nonfinite/*` count is above
-        zero, or `finite_part` is not finite. The checkpoints hold earlier, good states.
+        zero, or `params` are not finite. The checkpoints hold earlier, good states.
       CheckpointError: there are checkpoints but none that is readable and fits the state.
-      ValueError: an argument is out of range, or the evaluation lacks the selection metric.
+      ValueError: arguments do not fit together, or the evaluation lacks the selection metric.
     """
-    _check_intervals(total_steps, chunk_steps, checkpoint_every, evaluate_every)
-    if (evaluate is None) != (evaluate_every is None):
+    total_steps, title = rhythm.total_steps, display.title
+    if (evaluate is None) != (rhythm.evaluate_every is None):
         raise ValueError("Give both evaluate and evaluate_every, or neither.")
     if selection_metric is not None and evaluate is None:
         raise ValueError(f"selection_metric={selection_metric!r} needs evaluate.")
@@ -122,12 +146,10 @@ def run(
         raise ValueError(
             f"{run_directory.path} is open for reading; open it with RunDirectory.open_or_create."
         )
-    session: Session[State] = Session(
+    session: _Session[State] = _Session(
         state,
-        checkpointer or Checkpointer(run_directory.checkpoints),
+        Checkpointer(run_directory.checkpoints),
         MetricsLog(run_directory.path),
-        step_of=step_of,
-        finite_part=finite_part,
         may_be_nan=tuple(may_be_nan),
         selection_metric=selection_metric,
     )
@@ -136,7 +158,7 @@ def run(
             f"{run_directory.path} is at step {session.step}, past total_steps={total_steps}. Ask "
             "for more steps or choose another --workdir."
         )
-    progress = ProgressDisplay(title, total_steps, steps_unit, session.step)
+    progress = ProgressDisplay(title, total_steps, display.unit, session.step)
     if session.was_resumed:
         is_done = session.step == total_steps
         where = f"{run_directory.path} at step {session.step} of {total_steps}"
@@ -149,17 +171,17 @@ def run(
                 was_interrupted = True
                 break
             before = session.step
-            metrics = session.advance(chunk, min(chunk_steps, total_steps - before))
-            rate = session.report(metrics, before, steps_unit, work_per_step, work_unit)
+            metrics = session.advance(chunk, min(rhythm.chunk_steps, total_steps - before))
+            rate = session.report(metrics, before, display)
             if session.is_first_chunk:
                 progress.restart_clock(session.step)
-            progress.update(session.step, _note(rate, metrics, shown_metrics))
+            progress.update(session.step, _note(rate, metrics, display.metrics))
             is_last = session.step >= total_steps
-            is_due = _is_passed(checkpoint_every, before, session.step)
+            is_due = _is_passed(rhythm.checkpoint_every, before, session.step)
             if evaluate is not None and (
-                is_last or _is_passed(evaluate_every, before, session.step)
+                is_last or _is_passed(rhythm.evaluate_every, before, session.step)
             ):
-                is_due = session.evaluate(evaluate, on_evaluation) or is_due
+                is_due = session.evaluate(evaluate) or is_due
             if is_due:
                 session.save_latest()
         session.save_latest()
@@ -174,18 +196,6 @@ def run(
         was_resumed=session.was_resumed,
         last_evaluation=session.last_evaluation,
     )
-
-
-def _check_intervals(total: int, chunk: int, checkpoint: int, evaluation: int | None) -> None:
-    intervals = {
-        "total_steps": total,
-        "chunk_steps": chunk,
-        "checkpoint_every": checkpoint,
-        "evaluate_every": 1 if evaluation is None else evaluation,
-    }
-    for name, value in intervals.items():
-        if value < 1:
-            raise ValueError(f"{name} must be at least 1, got {value}.")
 
 
 def _is_passed(interval: int | None, before: int, after: int) -> bool:
@@ -223,3 +233,157 @@ def _interruption() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler or signal.SIG_DFL)
+
+
+class NonFiniteError(ArithmeticError):
+    """A metric or a parameter is not finite; the state that has it is never saved."""
+
+
+class _Session(Generic[State]):
+    """The state of a run with its bookkeeping, from a checkpoint or from the start."""
+
+    def __init__(
+        self,
+        state: State,
+        checkpointer: Checkpointer,
+        log: MetricsLog,
+        *,
+        may_be_nan: tuple[str, ...],
+        selection_metric: str | None,
+    ) -> None:
+        self.log = log
+        self._checkpointer = checkpointer
+        self._may_be_nan, self._selection_metric = may_be_nan, selection_metric
+        self.last_evaluation: dict[str, float] | None = None
+        self.best_metric: float | None = None
+        self.best_step: int | None = None
+        self._elapsed_s = 0.0
+        self.was_resumed = bool(checkpointer.steps("latest"))
+        self.is_first_chunk = False
+        self._num_chunks = 0
+        if self.was_resumed:
+            state, metadata = checkpointer.restore("latest", state)
+            self.best_metric, self.best_step = metadata["best_metric"], metadata["best_step"]
+            self._elapsed_s = metadata["elapsed_s"]
+        self.state = state
+        self.step = self._saved_step = _step_of(state)
+        # Whatever was recorded after the checkpoint is made again, identically.
+        checkpointer.discard_after(self.step if self.was_resumed else -1)
+        log.cut_back(self.step if self.was_resumed else -1)
+        self.start_clock()
+
+    def start_clock(self) -> None:
+        self._clock = time.monotonic()
+
+    def _lap(self) -> float:
+        """Seconds since the last lap, added to the run's elapsed time."""
+        now = time.monotonic()
+        lap, self._clock = now - self._clock, now
+        self._elapsed_s += lap
+        return lap
+
+    def advance(
+        self, chunk: Callable[[State, int], tuple[State, Scalars]], n: int
+    ) -> dict[str, float]:
+        """Runs one chunk of n steps; returns its metrics as floats, checked to be finite."""
+        before = self.step
+        state, metrics = chunk(self.state, n)
+        self.state = state
+        values = _floats(metrics)
+        self.step = _step_of(state)
+        self._num_chunks += 1
+        self.is_first_chunk = self._num_chunks == 1
+        if self.step != before + n:
+            raise ValueError(
+                f"The chunk was asked for {n} steps from {before} and ended at {self.step}; the "
+                "step counter of the state must count the loop's steps."
+            )
+        self._check_finite(values)
+        return values
+
+    def _check_finite(self, values: Mapping[str, float]) -> None:
+        for name, value in values.items():
+            counted = name.startswith("nonfinite/") and value != 0
+            may_be_nan = any(fnmatch.fnmatchcase(name, pattern) for pattern in self._may_be_nan)
+            if counted or (not math.isfinite(value) and not may_be_nan):
+                self._stop(f"{name} is {value}", values)
+
+    def _stop(self, what: str, values: Mapping[str, float]) -> None:
+        self.log.sync()
+        steps = self._checkpointer.steps("latest")
+        last = f"the checkpoint of step {steps[-1]} is good" if steps else "none was saved before"
+        listed = ", ".join(f"{name}={value:.4g}" for name, value in values.items())
+        raise NonFiniteError(
+            f"{what} at step {self.step}; {last}. Lower the learning rate, or rerun with "
+            f"--debug_nans to find the operation. Metrics: {listed}"
+        )
+
+    def report(self, metrics: Mapping[str, float], before: int, display: Display) -> str:
+        """Records the metrics of a chunk; returns the rate, for display."""
+        lap_s = max(self._lap(), 1e-9)
+        rate = (self.step - before) / lap_s
+        times = {"elapsed_s": self._elapsed_s, "steps_per_s": rate}
+        text = f"{rate:,.3g} {display.unit}/s"
+        if display.work_per_step is not None:
+            times["work_per_s"] = rate * display.work_per_step
+            text = f"{times['work_per_s']:,.0f} {display.work_unit}/s"
+        timed = {TIME_PREFIX + name: value for name, value in times.items()}
+        self.log.write(self.step, {**metrics, **timed})
+        return f"{duration(self._elapsed_s)}  {text}"
+
+    def evaluate(self, evaluate: Callable[[State], Scalars]) -> bool:
+        """Evaluates and records; saves a new best state and says whether there was one."""
+        found = _floats(evaluate(self.state))
+        self.last_evaluation = found
+        selected = self._selection_metric
+        if selected is not None and selected not in found:
+            raise ValueError(
+                f"selection_metric={selected!r} is not in the evaluation, which has: "
+                f"{', '.join(found)}."
+            )
+        lap = {TIME_PREFIX + "evaluation_s": self._lap()}
+        if selected is not None and not math.isfinite(found[selected]):
+            self._stop(f"{selected} is {found[selected]}", found)
+        self.log.write(self.step, {**found, **lap})
+        if selected is None or (
+            self.best_metric is not None and found[selected] <= self.best_metric
+        ):
+            return False
+        self.best_metric, self.best_step = found[selected], self.step
+        self._save("best")
+        return True
+
+    def save_latest(self) -> None:
+        """Saves the state from which a later process goes on, unless that was done already."""
+        if self._saved_step != self.step:
+            self._save("latest")
+            self._saved_step = self.step
+
+    def _save(self, kind: Kind) -> None:
+        for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(self.state, "params", ())):
+            value = np.asarray(leaf)
+            is_float = jnp.issubdtype(value.dtype, jnp.inexact)
+            if is_float and not np.isfinite(value).all():
+                self._stop(f"{jax.tree_util.keystr(path)} of the state is not finite", {})
+        self.log.sync()
+        self._lap()
+        metadata = {
+            "best_metric": self.best_metric,
+            "best_step": self.best_step,
+            "elapsed_s": self._elapsed_s,
+        }
+        self._checkpointer.save(kind, self.step, self.state, metadata)
+
+
+def _step_of(state: Any) -> int:
+    return int(state.step)
+
+
+def _floats(scalars: Scalars) -> dict[str, float]:
+    values = jax.device_get(dict(scalars))
+    for name, value in values.items():
+        if np.ndim(value):
+            raise ValueError(
+                f"Metric {name} has shape {np.shape(value)}; chunks and evaluations return scalars."
+            )
+    return {name: float(value) for name, value in values.items()}

@@ -1,45 +1,203 @@
-"""Recordings of what actions do: collected, saved, loaded. NumPy only.
-
-A recording directory holds `recordings.npy`, all recordings as one memory-mapped array, and
-`manifest.json`: what they are and the hash of each finished action. An action counts only once
-its hash is in the manifest, so collecting can be killed at any instant and goes on later.
-"""
+"""Recordings of what actions do, in memory and as small files. NumPy only."""
 
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
-from collections.abc import Mapping
+import math
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from jaxnew._collection import RecordBlock, collect_into
-from jaxnew._files import write_bytes_atomically
-from jaxnew._recordings import (
-    ActionObservations,
-    ObservationsError,
-    RecordingFormat,
-    checked_ids,
-    open_data,
-    read_manifest,
-    row_hash,
-)
-from jaxnew.actions import ActionUniverse
+from jaxnew.actions import ActionUniverse, content_hash
+from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
 
-__all__ = [
-    "ActionObservations",
-    "ObservationsError",
-    "RecordBlock",
-    "RecordingFormat",
-    "action_rng",
-    "collect",
-    "load",
-    "load_npz",
-    "save_npz",
-]
+UNKNOWN_MODALITY = "unknown"
+
+
+class ObservationsError(ValueError):
+    """Recordings are missing, unfinished, damaged, or not those that were asked for."""
+
+
+@dataclass(frozen=True)
+class RecordingFormat:
+    """What one recording is.
+
+    Attributes:
+      modality: play environment and version, e.g. `GridWorld-v0 play`.
+      shape: shape of one recording, e.g. `(T, D)` or `(T, H, W, C)`.
+      dtype: NumPy name of the stored type, e.g. `uint8`.
+      low, high: inclusive bounds of the values, or None. Floats must be finite in any case.
+    """
+
+    modality: str
+    shape: tuple[int, ...]
+    dtype: str
+    low: float | None = None
+    high: float | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "dtype", np.dtype(self.dtype).name)
+
+    def estimate_bytes(self, num_actions: int, num_recordings: int) -> int:
+        """Size of the recordings of `num_actions` actions."""
+        return num_actions * num_recordings * math.prod(self.shape) * np.dtype(self.dtype).itemsize
+
+    def problem(self, data: np.ndarray, shape: tuple[int, ...], with_values: bool) -> str | None:
+        """Says how `data` differs from an array of `shape` in this format, or None if it does not.
+
+        Args:
+          with_values: also look at every value, not only at shape and dtype.
+        """
+        if data.shape != shape:
+            return f"has shape {data.shape}, expected {shape}"
+        if data.dtype != np.dtype(self.dtype):
+            return f"has dtype {data.dtype}, expected {self.dtype}"
+        if not with_values or data.size == 0:
+            return None
+        if np.issubdtype(data.dtype, np.inexact) and not np.isfinite(data).all():
+            return "has a value that is not finite"
+        low, high = data.min(), data.max()
+        if (self.low is not None and low < self.low) or (
+            self.high is not None and high > self.high
+        ):
+            return f"has values in [{low}, {high}], expected [{self.low}, {self.high}]"
+        return None
+
+
+@dataclass(frozen=True)
+class Recordings:
+    """S recordings of each of some actions.
+
+    Attributes:
+      data: [A, S, *format.shape] of `format.dtype`, possibly memory-mapped and read-only.
+      ids: int32[A] the action of each row; each id once.
+      format: what one recording is.
+      universe_hash: of the universe that the ids belong to, or None for actions outside of it.
+      action_hashes: A hashes of the recordings of each action.
+    """
+
+    data: np.ndarray
+    ids: np.ndarray
+    format: RecordingFormat
+    universe_hash: str | None
+    action_hashes: tuple[str, ...]
+
+    @property
+    def num_actions(self) -> int:
+        return len(self.ids)
+
+    @property
+    def num_recordings(self) -> int:
+        return int(self.data.shape[1])
+
+    @property
+    def hash(self) -> str:
+        """Identifies the recordings by content, actions and modality."""
+        head = f"{self.universe_hash} {self.format.modality}"
+        return content_hash(head, self.ids, *self.action_hashes)
+
+    def rows(self, ids: np.ndarray) -> np.ndarray:
+        """int64[n] rows of `data` that hold the actions `ids`.
+
+        Raises:
+          ObservationsError: an action was not recorded.
+        """
+        row_of = {action_id: row for row, action_id in enumerate(self.ids.tolist())}
+        missing = [action_id for action_id in np.ravel(ids).tolist() if action_id not in row_of]
+        if missing:
+            raise ObservationsError(
+                f"No recordings of action {missing[0]} ({len(missing)} of {np.size(ids)} asked for "
+                "are missing). Collect them, or ask for recorded actions only."
+            )
+        return np.array([row_of[action_id] for action_id in np.ravel(ids).tolist()], np.int64)
+
+    def select(self, ids: np.ndarray) -> Recordings:
+        """The recordings of `ids`, in that order, copied into memory.
+
+        Raises:
+          ObservationsError: an action was not recorded.
+        """
+        rows = self.rows(ids)
+        hashes = tuple(self.action_hashes[row] for row in rows)
+        data = np.asarray(self.data[rows])
+        return Recordings(data, self.ids[rows], self.format, self.universe_hash, hashes)
+
+    def fits(self, format: RecordingFormat) -> Recordings:
+        """These recordings as ones of `format`, which an encoder reads.
+
+        Raises:
+          ObservationsError: they are of another modality, shape or dtype, or out of its bounds.
+        """
+        if self.format.modality not in (format.modality, UNKNOWN_MODALITY):
+            raise ObservationsError(
+                f"These are recordings of {self.format.modality!r}; the encoder knows "
+                f"{format.modality!r}."
+            )
+        shape = (self.num_actions, self.num_recordings, *format.shape)
+        problem = format.problem(self.data, shape, True)
+        if problem is not None:
+            raise ObservationsError(f"The array `recordings` {problem}.")
+        return replace(self, format=format)
+
+    def save(self, path: Path | str) -> None:
+        """Writes one small file with the arrays `ids`, `recordings` and `modality`."""
+        buffer = io.BytesIO()
+        np.savez_compressed(
+            buffer,
+            ids=self.ids,
+            recordings=self.data,
+            modality=np.array(self.format.modality),
+        )
+        write_bytes_atomically(Path(path), buffer.getvalue())
+
+    @classmethod
+    def load(cls, path: Path | str) -> Recordings:
+        """Reads recordings of new actions, which need not exist in any universe.
+
+        Args:
+          path: a file with `ids` int[A] (names of the new actions, each once), `recordings`
+            [A, S, ...] with S >= 1 and, optionally, the string `modality`. An encoder checks that
+            it was trained on such recordings, see `fits`.
+
+        Raises:
+          ObservationsError: the file is missing or damaged, or its arrays do not belong together.
+        """
+        arrays = _read_npz(Path(path))
+        ids, data = checked_ids(arrays["ids"], None, str(path)), arrays["recordings"]
+        if data.ndim < 2 or data.shape[0] != len(ids) or 0 in data.shape:
+            raise ObservationsError(
+                f"{path}: the array `recordings` has shape {data.shape}, expected [{len(ids)}, S, "
+                "...], S >= 1 recordings of each action."
+            )
+        if data.dtype.kind not in "biuf":
+            raise ObservationsError(f"{path}: the array `recordings` has dtype {data.dtype}.")
+        modality = str(arrays.get("modality", UNKNOWN_MODALITY))
+        format = RecordingFormat(modality, data.shape[2:], data.dtype.name)
+        return cls(data, ids, format, None, tuple(row_hash(rows) for rows in data))
+
+
+def checked_ids(ids: np.ndarray, universe: ActionUniverse | None, where: str) -> np.ndarray:
+    """int32[n] copy of distinct legal ids."""
+    checked = np.asarray(ids)
+    if checked.ndim != 1 or checked.size == 0 or not np.issubdtype(checked.dtype, np.integer):
+        raise ObservationsError(
+            f"{where}: ids must be a non-empty vector of integers, got {checked.dtype}"
+            f"{list(checked.shape)}."
+        )
+    limit = 2**31 if universe is None else universe.num_actions
+    if checked.min() < 0 or checked.max() >= limit:
+        raise ObservationsError(
+            f"{where}: ids span {checked.min()}..{checked.max()}; legal are 0..{limit - 1}."
+        )
+    if len(np.unique(checked)) != len(checked):
+        raise ObservationsError(f"{where}: an id is listed twice; list each once.")
+    return checked.astype(np.int32)
+
+
+def row_hash(rows: np.ndarray) -> str:
+    """Hash of the recordings of one action."""
+    return str(content_hash(np.asarray(rows)))
 
 
 def action_rng(seed: int, action_id: int) -> np.random.Generator:
@@ -47,128 +205,12 @@ def action_rng(seed: int, action_id: int) -> np.random.Generator:
     return np.random.default_rng(np.random.SeedSequence([seed, action_id]))
 
 
-def collect(
-    path: Path | str,
-    record_block: RecordBlock,
-    *,
-    format: RecordingFormat,
-    universe: ActionUniverse,
-    ids: np.ndarray,
-    num_recordings: int,
-    seed: int,
-    block_actions: int,
-    play_settings: Mapping[str, Any] | None = None,
-) -> ActionObservations:
-    """Records actions into the directory `path`; goes on where an earlier call was killed.
-
-    Says how large the result will be, and shows progress. Where another process collects there, it
-    waits. Calling it again when everything is recorded only checks the recordings; damaged ones are
-    made again.
-
-    Args:
-      record_block: `(seed, ids int32[n], num_recordings) -> [n, num_recordings, *format.shape]`,
-        n always the same. The recordings of an id must depend on `seed`, the id and
-        `num_recordings` only, not on the other ids (`action_rng`; `jax.random.fold_in(key, id)`):
-        then the result does not depend on `block_actions`, nor on where a killed call stopped.
-      ids: int[A] actions to record, in the order of the rows.
-      block_actions: actions per call of `record_block` (at most A); only a matter of speed.
-      play_settings: plain JSON; whatever else fixes the recordings, e.g. environment parameters.
-
-    Raises:
-      ObservationsError: `path` holds something else or recordings with other settings, the disk is
-        too small, or `record_block` broke its promise.
-    """
-    collect_into(
-        Path(path),
-        record_block,
-        format=format,
-        universe=universe,
-        ids=ids,
-        num_recordings=num_recordings,
-        seed=seed,
-        block_actions=block_actions,
-        play_settings=play_settings or {},
-    )
-    return load(path, universe, verify=False)
-
-
-def load(path: Path | str, universe: ActionUniverse, verify: bool = True) -> ActionObservations:
-    """Opens recordings without reading them into memory.
-
-    Args:
-      universe: must be the one whose actions were recorded.
-      verify: read every recording once, to compare its hash and check its values.
-
-    Raises:
-      ObservationsError: there are none, they are unfinished or damaged, or they belong to another
-        universe.
-    """
-    path = Path(path)
-    manifest = read_manifest(path)
-    settings = manifest["settings"]
-    recorded = settings["universe"]
-    if recorded["hash"] != universe.hash:
-        raise ObservationsError(
-            f"{path} holds recordings of universe {recorded['name']} {recorded['hash']}, asked for "
-            f"was {universe.name} {universe.hash}. Collect the actions of this universe."
-        )
-    hashes = manifest["action_hashes"]
-    if None in hashes:
-        raise ObservationsError(
-            f"{path} is unfinished: {len(hashes) - hashes.count(None)} of {len(hashes)} actions "
-            "are recorded. Run collect again with the same settings to go on."
-        )
-    format = RecordingFormat(**{**settings["format"], "shape": tuple(settings["format"]["shape"])})
-    ids = checked_ids(np.array(manifest["ids"]), universe, str(path))
-    data = open_data(path, format, (len(ids), settings["num_recordings"], *format.shape))
-    for row in range(len(ids) if verify else 0):
-        problem = format.problem(data[row], data.shape[1:], True)
-        if problem is None and row_hash(data[row]) != hashes[row]:
-            problem = "has other bytes than were recorded"
-        if problem is not None:
-            raise ObservationsError(
-                f"{path}: the recording of action {ids[row]} {problem}. Run collect again to "
-                "repair it."
-            )
-    return ActionObservations(data, ids, format, universe.hash, tuple(hashes))
-
-
-def save_npz(path: Path | str, observations: ActionObservations) -> None:
-    """Writes recordings as one small file with the arrays `ids`, `recordings` and `modality`."""
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        ids=observations.ids,
-        recordings=observations.data,
-        modality=np.array(observations.format.modality),
-    )
-    write_bytes_atomically(Path(path), buffer.getvalue())
-
-
-def load_npz(path: Path | str, format: RecordingFormat) -> ActionObservations:
-    """Reads recordings of new actions, which need not exist in any universe.
-
-    Args:
-      path: a file with `ids` int[A] (names of the new actions, each once), `recordings`
-        [A, S, *format.shape] and, optionally, the string `modality`.
-      format: what the encoder was trained on.
-
-    Raises:
-      ObservationsError: the file is missing or damaged, or what it holds does not fit `format`.
-    """
-    path = Path(path)
+def _read_npz(path: Path) -> dict[str, np.ndarray]:
+    """The arrays of a file that has at least `ids` and `recordings`."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except (
-        OSError,
-        ValueError,
-        EOFError,
-        AttributeError,
-        TypeError,
-        zipfile.BadZipFile,
-        zlib.error,
-    ) as err:
+    except UNREADABLE_NPZ as err:
         raise ObservationsError(
             f"{path} is missing or damaged ({err}); it must be an .npz file with the arrays `ids` "
             "and `recordings`."
@@ -176,17 +218,4 @@ def load_npz(path: Path | str, format: RecordingFormat) -> ActionObservations:
     for name in ("ids", "recordings"):
         if name not in arrays:
             raise ObservationsError(f"{path} lacks the array {name!r}; it has {sorted(arrays)}.")
-    modality = str(arrays.get("modality", format.modality))
-    if modality != format.modality:
-        raise ObservationsError(
-            f"{path} holds recordings of {modality!r}; the encoder knows {format.modality!r}."
-        )
-    ids, data = checked_ids(arrays["ids"], None, str(path)), arrays["recordings"]
-    num_recordings = data.shape[1] if data.ndim > 1 else 0
-    problem = format.problem(data, (len(ids), num_recordings, *format.shape), True)
-    if problem is None and num_recordings == 0:
-        problem = "has no recording"
-    if problem is not None:
-        raise ObservationsError(f"{path}: the array `recordings` {problem}.")
-    hashes = tuple(row_hash(rows) for rows in data)
-    return ActionObservations(data, ids, format, None, hashes)
+    return arrays

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, replace
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -113,11 +116,134 @@ def check_set_size(pool: ActionPool, set_size: int, name: str = "pool") -> None:
             )
 
 
-def whole_pool(pool: ActionPool) -> AvailableSet:
-    """The set that holds every member of `pool`, padded to its capacity and masked."""
-    num_always = pool.always_available.shape[0]
-    ids = jnp.concatenate([pool.always_available, pool.ids])
-    return AvailableSet(ids, jnp.arange(ids.shape[0]) < pool.size + num_always)
+@dataclass(frozen=True)
+class SetConfig:
+    """Which sets a policy is trained with; all static.
+
+    Attributes:
+      size: m, actions available in an episode.
+      padded_size: width of the sets; entries past `size` are masked. 0 means `size`.
+      is_fixed: all actions of training are available in every episode; the sizes are not used.
+    """
+
+    size: int = 50
+    padded_size: int = 0
+    is_fixed: bool = False
+
+    def __post_init__(self) -> None:
+        if self.size < 1:
+            raise ValueError(f"size={self.size} must be at least 1.")
+        if self.padded_size and self.padded_size < self.size:
+            raise ValueError(
+                f"padded_size={self.padded_size} is below size={self.size}; use 0 for no padding."
+            )
+
+
+@struct.dataclass
+class Actions:
+    """What a policy is offered: the representation of every action, and the sets of an episode.
+
+    Everything that plays episodes takes one. The arrays are traced and the rest is static: one
+    program serves the train, validation and test actions of a run.
+
+    Attributes:
+      table: f32[A, d] representations; row i describes action i.
+      pool: actions that sets are drawn from.
+      set_size: m, actions available in an episode.
+      padded_size: width of the sets; entries past `set_size` are masked.
+      is_fixed: every member of the pool is available in every episode, in the pool's order; the set
+        is stored once, not per environment.
+      first_size: actions of a set that are available at the first step, 0 for all of them; then
+        `growth` more become available at every step.
+      growth: see `first_size`.
+    """
+
+    table: jax.Array
+    pool: ActionPool
+    set_size: int = struct.field(pytree_node=False)
+    padded_size: int = struct.field(pytree_node=False)
+    is_fixed: bool = struct.field(pytree_node=False, default=False)
+    first_size: int = struct.field(pytree_node=False, default=0)
+    growth: int = struct.field(pytree_node=False, default=1)
+
+    @classmethod
+    def of(
+        cls,
+        table: jax.Array | np.ndarray,
+        ids: np.ndarray,
+        set_size: int | None = None,
+        *,
+        padded_size: int = 0,
+        always_available: np.ndarray | None = None,
+        groups: np.ndarray | None = None,
+        name: str = "the actions",
+    ) -> Actions:
+        """Sets of `set_size` actions that are drawn from `ids`.
+
+        Args:
+          table: f32[A, d].
+          ids: int[n] actions to draw from, each once.
+          set_size: None: all of them are available in every episode.
+          padded_size: width of the sets, 0 for `set_size`.
+          always_available: int[q] ids that are in every set and count into its size.
+          groups: int[n] label of the group of each id; sets are drawn from half of the groups.
+          name: of the ids, for messages.
+
+        Raises:
+          ValueError: there are no such sets.
+        """
+        table = jnp.asarray(table)
+        if set_size is None:
+            pool = ActionPool.of(ids, capacity=len(ids), always_available=always_available)
+            width = len(ids) + pool.always_available.shape[0]
+            return cls(table, pool, int(pool.size) + width - len(ids), width, is_fixed=True)
+        pool = ActionPool.of(
+            ids, capacity=len(table), always_available=always_available, groups=groups
+        )
+        check_set_size(pool, set_size, name)
+        return cls(table, pool, set_size, padded_size or set_size)
+
+    def growing(self, first_size: int, growth: int = 1) -> Actions:
+        """The same sets, of which `first_size` actions are there at first, see `first_size`.
+
+        Raises:
+          ValueError: a size is out of range.
+        """
+        if not 0 <= first_size <= self.set_size or growth < 0:
+            raise ValueError(
+                f"first_size={first_size} must be in 0..{self.set_size} (the set size) and "
+                f"growth={growth} at least 0."
+            )
+        return replace(self, first_size=first_size, growth=growth)
+
+    @property
+    def num_actions(self) -> int:
+        """How many actions sets are drawn from, those that are always available included."""
+        return int(self.pool.size) + int(self.pool.always_available.shape[0])
+
+    def draw(self, keys: jax.Array) -> AvailableSet:
+        """One set per key, [..., padded_size], or the fixed set [n]; consumes `keys`."""
+        if self.is_fixed:
+            ids = jnp.concatenate([self.pool.always_available, self.pool.ids])
+            return AvailableSet(ids, jnp.arange(ids.shape[0]) < self.set_size)
+        return draw_sets(keys, self.pool, self.set_size, self.padded_size)
+
+    def offered(self, available: AvailableSet) -> jax.Array:
+        """f32[R, d] the rows of the table that may be needed: of a fixed set, or all."""
+        return self.table[available.ids] if self.is_fixed else self.table
+
+    def rows(self, offered: jax.Array, available: AvailableSet) -> jax.Array:
+        """[..., m, p] of what was computed from `offered` [R, p], the rows of some sets."""
+        return offered if self.is_fixed else offered[available.ids]
+
+    def at(self, available: AvailableSet, t: Any) -> AvailableSet:
+        """What may be chosen at step t int[] or int[...]: sets are in random order, so a beginning
+        is a set, too.
+        """
+        if not self.first_size:
+            return available
+        now = np.arange(self.padded_size) < self.first_size + self.growth * t[..., None]
+        return AvailableSet(available.ids, available.mask & now)
 
 
 def draw_sets(

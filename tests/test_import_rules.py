@@ -109,7 +109,7 @@ def is_ours(name: str) -> bool:
 
 
 def layer_of(module: str) -> int:
-    """Index into `LAYERS`; private modules (`jaxnew._files`) are support."""
+    """Index into `LAYERS`; private modules (`jaxnew.storage.files`) are support."""
     part = module.split(".")[1]
     if part.startswith("_"):
         return 0

@@ -54,7 +54,7 @@ def record_block(
 ) -> np.ndarray:
     """The viewpoints that shapes are recorded from; `draw_pictures` makes pictures of them.
 
-    See `jaxnew.observations.collect`.
+    See `jaxnew.collection.collect`.
 
     Args:
       seed: of the viewpoints, which all shapes share.

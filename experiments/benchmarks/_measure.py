@@ -21,7 +21,7 @@ from typing import Any
 import jax
 from absl import app, flags, logging
 
-from jaxnew._provenance import describe_session
+from jaxnew.storage.provenance import describe_session
 
 QUICK = flags.DEFINE_bool("quick", False, "Tiny sizes: checks that it runs; the times say nothing.")
 OUTPUT = flags.DEFINE_string("output", None, "File that results are appended to, as JSON lines.")

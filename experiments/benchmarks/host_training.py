@@ -18,7 +18,7 @@ from absl import flags
 
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
-from jaxnew.metrics import TIME_PREFIX
+from jaxnew.storage.metrics import TIME_PREFIX
 
 TASK = flags.DEFINE_string("host_task", "create-push", "A task with environments on the host.")
 

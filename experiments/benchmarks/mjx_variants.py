@@ -33,7 +33,7 @@ from envs_mjx.shape_stacking.solids import DOME_AXIS_HEIGHT, solids
 from experiments import stacking_figures as figures
 from experiments.benchmarks import _measure as m
 from experiments.untrained import towers as stacking
-from jaxnew._provenance import describe_session
+from jaxnew.storage.run_directory import describe_session
 
 WORLDS = flags.DEFINE_integer("worlds", 6, "Worlds of each stage of random play.", lower_bound=1)
 _STAGES = (4, 7, 10)

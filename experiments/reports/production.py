@@ -14,9 +14,9 @@ from experiments.pipeline.flags import UsageError, budget_of, load_task
 from experiments.pipeline.machinery import environment_settings, in_group, pool_assignments
 from experiments.pipeline.methods import adapted
 from experiments.reports.runs import Run, read_runs
-from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run_directory import RunDirectoryError
+from jaxnew.storage import config as config_lib
+from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task import StageTwoBudget
 
 _EQUAL = ("num_updates", "hyperparameters", "ppo")  # Fields that make runs the same setting.

@@ -23,10 +23,10 @@ from experiments.reports.paper import (
 )
 from experiments.reports.plots import Metric
 from jaxnew.actions import ActionSplit
-from jaxnew.config import differences
-from jaxnew.metrics import read
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run_directory import RunDirectory
+from jaxnew.storage.config import differences
+from jaxnew.storage.metrics import read
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task import Task
 
 # Fields that tell settings of one method and representation apart in a label, most telling first.

@@ -16,7 +16,7 @@ from experiments.reports.jobs import Job, announce, sweep_job, train_job
 from experiments.reports.production import Cell, Source
 from experiments.reports.runs import Group, Run, group_runs, read_runs
 from experiments.reports.study_report import Study, StudyPoint
-from jaxnew.run_directory import RunDirectoryError
+from jaxnew.storage.run_directory import RunDirectoryError
 
 
 @dataclass(frozen=True)

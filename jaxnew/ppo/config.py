@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from jaxnew.rollout.device import RolloutConfig
+from jaxnew.rollout.contract import RolloutConfig
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,8 @@ from jaxnew.policy import PolicyMethod
 from jaxnew.ppo.advantages import gae
 from jaxnew.ppo.config import PPOConfig
 from jaxnew.ppo.objective import Hyperparameters, Minibatch, loss, normalize_advantages
-from jaxnew.rollout.batch import RolloutBatch
-from jaxnew.sampling import AvailableSet
+from jaxnew.rollout.contract import Policy, Rollout, RolloutBatch
+from jaxnew.sampling import Actions, AvailableSet
 
 Metrics = dict[str, jax.Array]
 
@@ -38,23 +38,28 @@ class TrainState:
     key: jax.Array
     step: jax.Array
 
+    @property
+    def policy(self) -> Policy:
+        """What acts."""
+        return Policy(self.params, self.rollout.observation_statistics)
+
 
 @dataclass(frozen=True)
 class GradientSteps:
-    """What learners share: the gradient steps on one rollout. All methods are pure.
+    """The gradient steps on one rollout. All methods are pure.
 
     Attributes:
       rollout: has the `method` that is trained.
       config: shapes and counts.
     """
 
-    rollout: Any
+    rollout: Rollout
     config: PPOConfig
 
     @property
     def method(self) -> PolicyMethod:
-        method: PolicyMethod = self.rollout.method
-        return method
+        """The policy."""
+        return self.rollout.method
 
     @property
     def optimizer(self) -> optax.GradientTransformation:
@@ -64,24 +69,6 @@ class GradientSteps:
             optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-5),
         )
 
-    def init_state(
-        self,
-        key_run: jax.Array,
-        key_params: jax.Array,
-        observation: jax.Array,
-        representation_size: int,
-        rollout: Any,
-    ) -> TrainState:
-        """A state before the first update; consumes `key_params`, and `key_run` becomes the run's.
-
-        Args:
-          observation: one, as the policy sees it.
-          representation_size: d.
-          rollout: its state.
-        """
-        params = self.method.init(key_params, observation, representation_size)
-        return TrainState(params, self.optimizer.init(params), rollout, key_run, jnp.int32(0))
-
     def learn(
         self,
         key: jax.Array,
@@ -89,9 +76,8 @@ class GradientSteps:
         opt_state: Any,
         batch: RolloutBatch,
         hyperparameters: Hyperparameters,
-        table: jax.Array,
+        actions: Actions,
         step: jax.Array,
-        fixed_set: AvailableSet | None = None,
     ) -> tuple[Any, Any, Metrics]:
         """Gradient steps on one rollout; consumes `key`. Returns (params, opt_state, metrics)."""
         terminated = batch.done if self.config.time_limits_are_ends else batch.terminated
@@ -106,7 +92,7 @@ class GradientSteps:
         )
         transitions = Minibatch(
             observation=jnp.zeros_like(batch.done),  # Looked up per minibatch.
-            available=batch.available,
+            available=None if actions.is_fixed else batch.available,
             sample=batch.sample,
             log_prob=batch.log_prob,
             value=batch.value,
@@ -120,7 +106,9 @@ class GradientSteps:
             params, opt_state = carry
             minibatch = jax.tree.map(lambda x: x[indices], transitions)
             minibatch = replace(minibatch, observation=batch.observations(indices))
-            grads, metrics = self._gradient(params, minibatch, hyperparameters, table, fixed_set)
+            grads, metrics = self._gradient(
+                params, minibatch, hyperparameters, actions, batch.available
+            )
             updates, opt_state = self.optimizer.update(grads, opt_state, params)
             params = optax.apply_updates(
                 params, jax.tree.map(lambda u: -learning_rate * u, updates)
@@ -161,20 +149,21 @@ class GradientSteps:
         params: Any,
         minibatch: Minibatch,
         hyperparameters: Hyperparameters,
-        table: jax.Array,
-        fixed_set: AvailableSet | None = None,
+        actions: Actions,
+        available: AvailableSet,
     ) -> tuple[Any, Metrics]:
         """Gradient of the minibatch's loss, and the metrics of it.
 
         What can be available is projected once; microbatches add up the gradient of the projected
         rows, which one backward pass then carries into the parameters of the projection.
         """
-        rows = table if fixed_set is None else table[fixed_set.ids]
-        projected, pull_back = jax.vjp(lambda p: self.method.project(p, rows), params)
+        offered = actions.offered(available)
+        projected, pull_back = jax.vjp(lambda p: self.method.project(p, offered), params)
 
         def gradient_of(part: Minibatch) -> tuple[Any, Metrics]:
+            sets = available if actions.is_fixed else part.available
             return jax.grad(loss, argnums=(0, 1), has_aux=True)(
-                params, projected, part, self.method, hyperparameters, fixed_set
+                params, projected, part, sets, self.method, hyperparameters, actions
             )
 
         size = self.config.microbatch_size

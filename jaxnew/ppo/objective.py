@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import jax
@@ -9,7 +10,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.policy import PolicyMethod, distribution_and_value
-from jaxnew.sampling import AvailableSet
+from jaxnew.sampling import Actions, AvailableSet
 
 
 @struct.dataclass
@@ -32,6 +33,22 @@ class Hyperparameters:
     gae_lambda: float = 0.95
     value_coefficient: float = 0.5
 
+    def check(self) -> None:
+        """Raises ValueError unless every number, none of them traced, is in its range."""
+        ranges = {
+            "learning_rate": (0.0, 1.0),
+            "entropy_coefficient": (0.0, math.inf),
+            "clip": (0.0, math.inf),
+            "discount": (0.0, 1.0),
+            "gae_lambda": (0.0, 1.0),
+            "value_coefficient": (0.0, math.inf),
+        }
+        for name, (low, high) in ranges.items():
+            value = getattr(self, name)
+            if not low <= value <= high:
+                bounds = f"at least {low:g}" if high == math.inf else f"in [{low:g}, {high:g}]"
+                raise ValueError(f"{name}={value} must be {bounds}.")
+
 
 @struct.dataclass
 class Minibatch:
@@ -39,7 +56,7 @@ class Minibatch:
 
     Attributes:
       observation: f32[B, ...] normalised, or uint8[B, H, W, C] images.
-      available: sets [B, m], or None where one set is in force in all of them.
+      available: sets [B, m], or None where one fixed set is in force in all of them.
       sample: what the policy drew, a pytree.
       log_prob: f32[B] its log-probability then.
       value: f32[B] value then.
@@ -68,28 +85,27 @@ def loss(
     params: Any,
     projected: jax.Array,
     minibatch: Minibatch,
+    available: AvailableSet,
     method: PolicyMethod,
     hyperparameters: Hyperparameters,
-    fixed_set: AvailableSet | None = None,
+    actions: Actions,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Clipped surrogate, clipped value loss and entropy bonus, means over the minibatch.
 
     Args:
       params: of the policy.
-      projected: `method.project` of the table f32[A, p], or of the fixed set f32[n, p]; handed in,
-        so that it is computed once per gradient step.
+      projected: `method.project` of `actions.offered`, f32[R, p]; handed in, so that it is computed
+        once per gradient step.
       minibatch: B transitions.
+      available: their sets [B, m], or the fixed one [n].
       method: the policy.
       hyperparameters: traced weights.
-      fixed_set: [n] what is available where the minibatch does not say.
+      actions: what the sets are of.
 
     Returns:
       The total loss f32[] and its parts, for the log.
     """
-    available = fixed_set if minibatch.available is None else minibatch.available
-    if available is None:
-        raise ValueError("The minibatch has no sets, and no fixed set is given.")
-    rows = projected if minibatch.available is None else projected[available.ids]
+    rows = actions.rows(projected, available)
     distribution, value = distribution_and_value(
         method, params, minibatch.observation, rows, available.mask
     )

@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxnew._files import write_bytes_atomically
 from jaxnew.actions import ActionSplit, ActionUniverse, SplitMismatch, content_hash
+from jaxnew.storage.files import write_bytes_atomically
 
 _TEXTS = ("universe_hash", "split_hash", "source", "hash")
 

@@ -18,7 +18,7 @@ from flax import struct
 
 from jaxnew.policy import PolicyMethod, distribution_and_value
 from jaxnew.rollout.frames import stacks_of
-from jaxnew.sampling import AvailableSet
+from jaxnew.sampling import Actions, AvailableSet
 
 WIDTH = 16
 
@@ -56,7 +56,7 @@ class Actor:
         self,
         params: Any,
         projected: jax.Array,
-        table: jax.Array,
+        actions: Actions,
         keys: jax.Array,
         observation: jax.Array,
         available: AvailableSet,
@@ -65,14 +65,13 @@ class Actor:
 
         Args:
           params: of the policy.
-          projected: `method.project` of the table, or of a set [m] that all have.
-          table: f32[A, d].
+          projected: `method.project` of `actions.offered`.
+          actions: what the sets are of.
           keys: [width], consumed.
           observation: [width, ...].
-          available: sets [width, m], or one [m].
+          available: sets [width, m], or the fixed one [m].
         """
-        is_shared = available.ids.ndim == 1
-        rows = projected if is_shared else projected[available.ids]
+        rows = actions.rows(projected, available)
         distribution, value = distribution_and_value(
             self.method, params, observation, rows, available.mask
         )
@@ -80,7 +79,7 @@ class Actor:
             sample = distribution.mode()
         else:
             sample = jax.vmap(lambda one, key: one.sample(key))(distribution, keys)
-        action = self.method.decode(sample, available, table)
+        action = self.method.decode(sample, available, actions.table)
         return Acting(sample, distribution.log_prob(sample), value, action.id, action.position)
 
 

@@ -1,57 +1,26 @@
-"""Rollouts of environments that run inside jit: one scan over vmapped steps."""
+"""Rollouts of environments that run inside jit: one scan over vmapped steps.
+
+An episode that is played for its own sake, episode `i`, draws its set, its start and its actions
+from `fold_in(key, i)`, and inference runs at one width, so that it is the same however many others
+are played beside it.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 
 from jaxnew.environment import Environment, Info
 from jaxnew.policy import PolicyMethod, distribution_and_value
-from jaxnew.rollout.batch import RolloutBatch
+from jaxnew.rollout.contract import Episode, Policy, RolloutBatch, RolloutConfig
 from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, AvailableSet, draw_sets, whole_pool
-
-
-@dataclass(frozen=True)
-class RolloutConfig:
-    """Shapes and rules of a rollout; all static.
-
-    Attributes:
-      num_envs: N, parallel environments.
-      num_steps: T, steps of each per update.
-      set_size: m, actions available in an episode.
-      padded_set_size: width of the sets; entries past `set_size` are masked. 0 means `set_size`.
-      has_fixed_set: the whole pool is available in every episode; the two sizes are not used.
-      normalize_observations: running normalisation (vector-state domains).
-      freezes_observation_statistics: the statistics that `init` is given are never updated.
-      normalize_rewards: division by the running deviation of the discounted return.
-      bootstraps_time_limits: value the final observation of truncated episodes; needed only if the
-        learner does not treat time limits as ends.
-    """
-
-    num_envs: int = 32
-    num_steps: int = 512
-    set_size: int = 50
-    padded_set_size: int = 0
-    has_fixed_set: bool = False
-    normalize_observations: bool = True
-    freezes_observation_statistics: bool = False
-    normalize_rewards: bool = True
-    bootstraps_time_limits: bool = False
-
-    def __post_init__(self) -> None:
-        for field in ("num_envs", "num_steps", "set_size"):
-            if getattr(self, field) < 1:
-                raise ValueError(f"{field}={getattr(self, field)} must be at least 1.")
-        if self.padded_set_size and self.padded_set_size < self.set_size:
-            raise ValueError(
-                f"padded_set_size={self.padded_set_size} is below set_size={self.set_size}; "
-                "use 0 for no padding."
-            )
+from jaxnew.sampling import Actions, AvailableSet
 
 
 @struct.dataclass
@@ -76,6 +45,11 @@ class RolloutState:
 
 
 _STOCK_EPISODES = 16
+
+
+def _number(name: str, info: Info, t: jax.Array) -> jax.Array:
+    """A metric of an episode after its step t, f32."""
+    return jnp.asarray(t + 1 if name == "num_steps" else info[name], jnp.float32)
 
 
 @struct.dataclass
@@ -103,31 +77,52 @@ class _Stock:
 
 @dataclass(frozen=True)
 class DeviceRollout:
-    """Draws sets, acts and steps; see `RolloutConfig`."""
+    """Draws sets, acts and steps, all pure; see `jaxnew.rollout.contract.Rollout`.
+
+    Attributes:
+      env, env_params: the task, with concrete parameters.
+      method: the policy.
+      config: shapes and rules.
+      width: episodes that `measure` and `episodes` play at a time.
+    """
 
     env: Environment
     env_params: Any
     method: PolicyMethod
     config: RolloutConfig
+    width: int = 128
+    is_traced = True
+
+    @property
+    def max_episode_steps(self) -> int:
+        """Length of the longest episode."""
+        return self.env.max_episode_steps(self.env_params)
+
+    @property
+    def episode_metrics(self) -> tuple[str, ...]:
+        """Those of the environment."""
+        return self.env.episode_metrics
+
+    @property
+    def observation(self) -> jax.ShapeDtypeStruct:
+        """Shape and dtype of one observation as the policy sees it."""
+        raw, _ = jax.eval_shape(self.env.reset, jax.random.key(0), self.env_params)
+        dtype = jnp.float32 if self.config.normalize_observations else raw.dtype
+        return jax.ShapeDtypeStruct(raw.shape, dtype)
 
     def init(
-        self,
-        key: jax.Array,
-        pool: ActionPool,
-        observation_statistics: RunningStatistics | None = None,
+        self, key: jax.Array, actions: Actions, statistics: RunningStatistics | None = None
     ) -> RolloutState:
         """Starts every environment, from fresh statistics or from given ones; consumes `key`."""
         key_reset, key_sets = jax.random.split(key)
         keys = jax.random.split(key_reset, self.config.num_envs)
         raw_obs, env_state = jax.vmap(self.env.reset, in_axes=(0, None))(keys, self.env_params)
-        statistics = observation_statistics or RunningStatistics.zeros(raw_obs.shape[1:])
+        statistics = statistics or RunningStatistics.zeros(raw_obs.shape[1:])
         obs, statistics = self._observe(raw_obs, statistics)
         return RolloutState(
             env_state=env_state,
             observation=obs,
-            available=whole_pool(pool)
-            if self.config.has_fixed_set
-            else self._draw(key_sets, (self.config.num_envs,), pool),
+            available=actions.draw(jax.random.split(key_sets, self.config.num_envs)),
             observation_statistics=statistics,
             return_statistics=RunningStatistics.zeros(()),
             discounted_return=jnp.zeros(self.config.num_envs),
@@ -138,43 +133,25 @@ class DeviceRollout:
         key: jax.Array,
         state: RolloutState,
         params: Any,
-        table: jax.Array,
-        pool: ActionPool,
+        actions: Actions,
         discount: jax.Array | float,
     ) -> tuple[RolloutState, RolloutBatch, dict[str, jax.Array]]:
-        """`num_steps` steps of every environment.
-
-        Args:
-          key: consumed.
-          state: where the last rollout ended.
-          params: of the policy.
-          table: f32[A, d] representations.
-          pool: actions that the sets of new episodes are drawn from.
-          discount: gamma of the return that scales rewards.
-
-        Returns:
-          The next state, the batch, and sums over the episodes that ended: `num_episodes` and each
-          of the environment's `episode_metrics`.
-        """
+        """`num_steps` steps of every environment; see `Rollout.collect`."""
         key_sets, key_steps = jax.random.split(key)
         shape = (self.config.num_steps, self.config.num_envs)
         key_samples, key_envs = jax.random.split(key_steps)
         keys = (jax.random.split(key_samples, shape[0]), jax.random.split(key_envs, shape))
-        if self.config.has_fixed_set:
-            projected = self.method.project(params, table[state.available.ids])
-            stock = None
-        else:
-            projected = self.method.project(params, table)
-            stock = self._restocked(key_sets, jnp.int32(0), pool)
+        projected = self.method.project(params, actions.offered(state.available))
+        stock = None if actions.is_fixed else self._restocked(key_sets, jnp.int32(0), actions)
 
         def step(
             carry: tuple[RolloutState, _Stock | None], keys: tuple[jax.Array, jax.Array]
         ) -> tuple[tuple[RolloutState, _Stock | None], tuple[RolloutBatch, jax.Array, Info]]:
             state, stock = carry
-            rows = projected if stock is None else projected[state.available.ids]
-            state, outputs = self._step(keys, state, params, table, rows, discount)
+            rows = actions.rows(projected, state.available)
+            state, outputs = self._step(keys, state, params, actions, rows, discount)
             if stock is not None:
-                stock = self._with_enough(stock, key_sets, pool)
+                stock = self._with_enough(stock, key_sets, actions)
                 stock, available = stock.deal(outputs[0].done, state.available)
                 state = replace(state, available=available)
             return (state, stock), outputs
@@ -183,6 +160,8 @@ class DeviceRollout:
         last_value = self.method.value(params, state.observation)
         next_value = jnp.concatenate([batch.value[1:], last_value[None]])
         batch = replace(batch, next_value=jnp.where(batch.done, final_values, next_value))
+        if actions.is_fixed:
+            batch = replace(batch, available=state.available)
         sums = {
             name: jnp.sum(jnp.where(batch.done, info[name], 0.0))
             for name in self.env.episode_metrics
@@ -194,7 +173,7 @@ class DeviceRollout:
         keys: tuple[jax.Array, jax.Array],
         state: RolloutState,
         params: Any,
-        table: jax.Array,
+        actions: Actions,
         projected: jax.Array,
         discount: jax.Array | float,
     ) -> tuple[RolloutState, tuple[RolloutBatch, jax.Array, Info]]:
@@ -209,7 +188,7 @@ class DeviceRollout:
         )(
             keys_env,
             state.env_state,
-            self.method.decode(sample, state.available, table),
+            self.method.decode(sample, state.available, actions.table),
             self.env_params,
         )
         done = terminated | truncated
@@ -223,7 +202,7 @@ class DeviceRollout:
         )
         batch = RolloutBatch(
             observation=state.observation,
-            available=None if self.config.has_fixed_set else state.available,
+            available=None if actions.is_fixed else state.available,
             sample=sample,
             log_prob=distribution.log_prob(sample),
             value=value,
@@ -243,13 +222,13 @@ class DeviceRollout:
         episode_info = {name: info[name] for name in self.env.episode_metrics}
         return next_state, (batch, final_value, episode_info)
 
-    def _restocked(self, key: jax.Array, num_draws: jax.Array, pool: ActionPool) -> _Stock:
+    def _restocked(self, key: jax.Array, num_draws: jax.Array, actions: Actions) -> _Stock:
         """`_STOCK_EPISODES` sets per environment, in one batched draw."""
         key = jax.random.fold_in(key, num_draws)
-        sets = self._draw(key, (_STOCK_EPISODES * self.config.num_envs,), pool)
+        sets = actions.draw(jax.random.split(key, _STOCK_EPISODES * self.config.num_envs))
         return _Stock(sets, jnp.int32(0), num_draws + 1)
 
-    def _with_enough(self, stock: _Stock, key: jax.Array, pool: ActionPool) -> _Stock:
+    def _with_enough(self, stock: _Stock, key: jax.Array, actions: Actions) -> _Stock:
         """The stock, or a new one if this one could run out in a step.
 
         A loop that runs at most once, not `cond`: under `vmap` that would draw at every step.
@@ -260,12 +239,8 @@ class DeviceRollout:
             return stock.num_dealt + num_envs > _STOCK_EPISODES * num_envs
 
         return jax.lax.while_loop(
-            runs_out, lambda stock: self._restocked(key, stock.num_draws, pool), stock
+            runs_out, lambda stock: self._restocked(key, stock.num_draws, actions), stock
         )
-
-    def _draw(self, key: jax.Array, shape: tuple[int, ...], pool: ActionPool) -> AvailableSet:
-        keys = jax.random.split(key, shape)
-        return draw_sets(keys, pool, self.config.set_size, self.config.padded_set_size or None)
 
     def _observe(
         self, raw_obs: jax.Array, statistics: RunningStatistics
@@ -288,3 +263,124 @@ class DeviceRollout:
             statistics = statistics.update(discounted_return)
             reward = statistics.scale(reward)
         return reward, jnp.where(done, 0.0, discounted_return), statistics
+
+    def measure(
+        self,
+        policy: Policy,
+        actions: Actions,
+        key: jax.Array,
+        num_episodes: int,
+        is_greedy: bool = False,
+    ) -> dict[str, np.ndarray]:
+        """Plays episodes `0..num_episodes-1`; see `Rollout.measure`."""
+        play = partial(self._play, is_greedy=is_greedy)
+        blocks = [
+            jax.tree.map(np.asarray, play(policy, actions, key, jnp.int32(start))[0])
+            for start in range(0, num_episodes, self.width)
+        ]
+        return {
+            name: np.concatenate([block[name] for block in blocks])[:num_episodes]
+            for name in blocks[0]
+        }
+
+    def episodes(
+        self,
+        policy: Policy,
+        actions: Actions,
+        key: jax.Array,
+        first: int,
+        count: int,
+        is_greedy: bool = False,
+    ) -> list[Episode]:
+        """Episodes `first..first+count-1` with every state; see `Rollout.episodes`."""
+        play = partial(self._play, is_greedy=is_greedy, keeps_all=True)
+        found: list[Episode] = []
+        for start in range(first, first + count, self.width):
+            block = jax.device_get(play(policy, actions, key, jnp.int32(start)))
+            found += [self._episode(block, row, start + row, actions) for row in range(self.width)]
+        return found[:count]
+
+    def play(
+        self,
+        policy: Policy,
+        actions: Actions,
+        key: jax.Array,
+        start: jax.Array,
+        is_greedy: bool = False,
+        keeps_all: bool = False,
+    ) -> tuple[dict[str, jax.Array], Any]:
+        """Episodes `start..start+width-1`, pure.
+
+        Args:
+          policy, actions, key, is_greedy: see `Rollout.measure`.
+          start: int32[], traced.
+          keeps_all: return what happened at every step, too.
+
+        Returns:
+          f32[width] per metric at the end of each episode; and None, or the sets [width, m], the
+          first states [width, ...] and, of each of the T steps of the longest episode, the states
+          after it, actions and rewards [T, width, ...].
+        """
+        episodes = start + jnp.arange(self.width)
+        keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(episodes)
+        keys_sets, keys_reset, keys_steps = keys[:, 0], keys[:, 1], keys[:, 2]
+        available = actions.draw(keys_sets)
+        obs, first_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
+            keys_reset, self.env_params
+        )
+        projected = self.method.project(policy.params, actions.offered(available))
+        rows = actions.rows(projected, available)
+
+        def step(carry: tuple[Any, ...], t: jax.Array) -> tuple[tuple[Any, ...], Any]:
+            obs, state, is_over, metrics = carry
+            if policy.observation_statistics is not None:
+                obs = self._normalize(obs, policy.observation_statistics)
+            now = actions.at(available, t)
+            distribution = self.method.distribution(policy.params, obs, rows, now.mask)
+            keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys_steps)
+            if is_greedy:
+                sample = distribution.mode()
+            else:
+                sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
+            action = self.method.decode(sample, now, actions.table)
+            obs, state, reward, terminated, truncated, info = jax.vmap(
+                self.env.step_env, in_axes=(0, 0, 0, None)
+            )(keys_now[:, 1], state, action, self.env_params)
+            metrics = {
+                name: jnp.where(is_over, old, _number(name, info, t))
+                for name, old in metrics.items()
+            }
+            kept = (state, action, reward) if keeps_all else None
+            return (obs, state, is_over | terminated | truncated, metrics), kept
+
+        names = (*self.env.episode_metrics, "num_steps")
+        zeros = {name: jnp.zeros(self.width) for name in names}
+        carry = (obs, first_state, jnp.zeros(self.width, bool), zeros)
+        carry, kept = jax.lax.scan(step, carry, jnp.arange(self.max_episode_steps))
+        return carry[3], (available, first_state, *kept) if keeps_all else None
+
+    @cached_property
+    def _play(self) -> Any:
+        return jax.jit(self.play, static_argnames=("is_greedy", "keeps_all"))
+
+    @staticmethod
+    def _episode(block: Any, row: int, number: int, actions: Actions) -> Episode:
+        """One row of what `play` returned."""
+        metrics, (available, first_state, states, played, rewards) = block
+        length = int(metrics["num_steps"][row])
+
+        def at(tree: Any, *index: int) -> Any:
+            return jax.tree.map(lambda x: x[index], tree)
+
+        ids = available.ids if actions.is_fixed else available.ids[row]
+        return Episode(
+            number=number,
+            actions=[at(played, t, row) for t in range(length)],
+            rewards=[float(rewards[t, row]) for t in range(length)],
+            metrics={name: float(values[row]) for name, values in metrics.items()},
+            available_ids=ids[: actions.set_size],
+            states=(at(first_state, row), *(at(states, t, row) for t in range(length))),
+        )
+
+    def close(self) -> None:
+        """Nothing is held."""

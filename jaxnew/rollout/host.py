@@ -17,7 +17,6 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxnew.metrics import TIME_PREFIX
 from jaxnew.policy import PolicyMethod
 from jaxnew.rollout.acting import (
     WIDTH,
@@ -28,11 +27,13 @@ from jaxnew.rollout.acting import (
     in_blocks,
     observation_of,
 )
-from jaxnew.rollout.batch import RolloutBatch
-from jaxnew.rollout.device import RolloutConfig
+from jaxnew.rollout.contract import Episode, Policy, RolloutBatch, RolloutConfig
 from jaxnew.rollout.frames import FrameHistory
+from jaxnew.rollout.host_episodes import EpisodePlayer
+from jaxnew.rollout.normalization import RunningStatistics
 from jaxnew.rollout.pool import HostEnvironments, HostStep, PoolState
-from jaxnew.sampling import ActionPool, AvailableSet, draw_sets, whole_pool
+from jaxnew.sampling import Actions, AvailableSet
+from jaxnew.storage.metrics import TIME_PREFIX
 
 
 @struct.dataclass
@@ -102,6 +103,7 @@ class HostRollout:
       environments: the pool; its number of environments is that of `config`.
       method: the policy.
       config: without normalisation: rewards are raw, and images are scaled by the network.
+      observation: shape and dtype of one observation as the policy sees it.
       width: environments that the policy looks at together.
 
     Raises:
@@ -111,7 +113,9 @@ class HostRollout:
     environments: HostEnvironments
     method: PolicyMethod
     config: RolloutConfig
+    observation: jax.ShapeDtypeStruct
     width: int = WIDTH
+    is_traced = False
 
     def __post_init__(self) -> None:
         if self.config.normalize_observations or self.config.normalize_rewards:
@@ -120,8 +124,21 @@ class HostRollout:
                 "ppo.rollout.normalize_observations and ppo.rollout.normalize_rewards to False."
             )
 
-    def init(self, key: jax.Array, pool: ActionPool) -> HostRolloutState:
-        """Starts every environment; consumes `key`."""
+    @property
+    def max_episode_steps(self) -> int:
+        """Length of the longest episode."""
+        return self.environments.max_episode_steps
+
+    @property
+    def episode_metrics(self) -> tuple[str, ...]:
+        """Those of the pool."""
+        return self.environments.pool.episode_metrics
+
+    def init(
+        self, key: jax.Array, actions: Actions, statistics: RunningStatistics | None = None
+    ) -> HostRolloutState:
+        """Starts every environment; consumes `key`. There are no statistics to go on with."""
+        del statistics
         num_envs = self.config.num_envs
         if self.environments.pool.num_envs != num_envs:
             raise ValueError(
@@ -136,32 +153,26 @@ class HostRollout:
             environments=self.environments.leave(),
             frames=frames,
             age=np.zeros(num_envs, np.int32),
-            available=whole_pool(pool)
-            if self.config.has_fixed_set
-            else self._draw(fold_in_each(key, jnp.arange(num_envs)), pool),
+            available=actions.draw(fold_in_each(key, jnp.arange(num_envs))),
         )
-
-    def first_observation(self, state: HostRolloutState) -> np.ndarray:
-        """What the policy sees in the first environment."""
-        has_stacks = self.environments.has_stacks
-        return observation_of(state.frames[:, :1], state.age[:1], has_stacks)[0]
 
     def collect(
         self,
         key: jax.Array,
         state: HostRolloutState,
         params: Any,
-        table: jax.Array,
-        pool: ActionPool,
+        actions: Actions,
+        discount: jax.Array | float,
     ) -> tuple[HostRolloutState, RolloutBatch, dict[str, np.float32]]:
-        """`num_steps` steps of every environment; see `DeviceRollout.collect`.
+        """`num_steps` steps of every environment; see `Rollout.collect`.
 
         The batch is in NumPy. Step t of environment n acts from `fold_in(fold_in(key, t), n)`. The
-        metrics have `time/act_s` and `time/wait_s`, too: seconds in which the policy chose, and in
-        which it waited for the pool.
+        sums have `time/act_s` and `time/wait_s`, too: seconds in which the policy chose, and in
+        which it waited for the pool. Rewards are not scaled, so that `discount` is not read.
         """
+        del discount
         key_sets, key_samples = jax.random.split(key)
-        run = _Run(self, state, params, table, pool, key_sets, key_samples)
+        run = _Run(self, state, params, actions, key_sets, key_samples)
         self.environments.resume(state.environments)
         run.play()
         k, record = run.record.k, run.record
@@ -170,23 +181,53 @@ class HostRollout:
             frames=record.frames[-k:].copy(),
             age=record.age[-1].copy(),
             available=state.available
-            if self.config.has_fixed_set
+            if actions.is_fixed
             else AvailableSet(jnp.asarray(run.set_ids), state.available.mask),
         )
         return next_state, run.batch(), record.sums() | run.seconds()
 
-    def _draw(self, keys: jax.Array, pool: ActionPool) -> AvailableSet:
-        return draw_sets(keys, pool, self.config.set_size, self.config.padded_set_size or None)
+    def measure(
+        self,
+        policy: Policy,
+        actions: Actions,
+        key: jax.Array,
+        num_episodes: int,
+        is_greedy: bool = False,
+    ) -> dict[str, np.ndarray]:
+        """Plays episodes `0..num_episodes-1`; see `Rollout.measure`."""
+        return self._player.play(policy, actions, key, num_episodes, is_greedy).results
+
+    def episodes(
+        self,
+        policy: Policy,
+        actions: Actions,
+        key: jax.Array,
+        first: int,
+        count: int,
+        is_greedy: bool = False,
+    ) -> list[Episode]:
+        """Episodes `first..first+count-1`; see `Rollout.episodes`. Those before are played, too."""
+        played = self._player.play(policy, actions, key, first + count, is_greedy, keeps_all=True)
+        numbers = range(first, first + count)
+        return [played.episode(number, key, actions.set_size) for number in numbers]
+
+    def close(self) -> None:
+        """Ends the pool."""
+        self.environments.close()
+
+    @cached_property
+    def _player(self) -> EpisodePlayer:
+        return EpisodePlayer(self.environments, self.method, self.width)
 
     @cached_property
     def draw_next(self) -> Any:
-        """(key, pool) -> sets [T, N, m], one for every step that may end an episode."""
+        """(key, actions) -> sets [T, N, m], one for every step that may end an episode."""
 
         @jax.jit
-        def draw(key: jax.Array, pool: ActionPool) -> AvailableSet:
+        def draw(key: jax.Array, actions: Actions) -> AvailableSet:
             steps = fold_in_each(key, jnp.arange(self.config.num_steps))
             envs = jnp.arange(self.config.num_envs)
-            return self._draw(jax.vmap(lambda key: fold_in_each(key, envs))(steps), pool)
+            return actions.draw(jax.vmap(lambda key: fold_in_each(key, envs))(steps))
 
         return draw
 
@@ -203,7 +244,7 @@ class HostRollout:
         def act(
             params: Any,
             projected: jax.Array,
-            table: jax.Array,
+            actions: Actions,
             key: jax.Array,
             t: jax.Array,
             envs: jax.Array,
@@ -212,7 +253,7 @@ class HostRollout:
         ) -> Acting:
             keys = fold_in_each(jax.random.fold_in(key, t), envs)
             actor = Actor(self.method)
-            return actor.act(params, projected, table, keys, observation, available)
+            return actor.act(params, projected, actions, keys, observation, available)
 
         return act
 
@@ -230,24 +271,22 @@ class _Run:
         rollout: HostRollout,
         state: HostRolloutState,
         params: Any,
-        table: jax.Array,
-        pool: ActionPool,
+        actions: Actions,
         key_sets: jax.Array,
         key_samples: jax.Array,
     ) -> None:
-        self.rollout, self.params, self.table, self.key = rollout, params, table, key_samples
+        self.rollout, self.params, self.actions, self.key = rollout, params, actions, key_samples
         self.config, self.environments = rollout.config, rollout.environments
         self.pool = rollout.environments.pool
         self.has_stacks = rollout.environments.has_stacks
         self.record = _Record(state, self.config.num_steps, self.pool.episode_metrics)
         self.act_s, self.wait_s = 0.0, 0.0
-        self.fixed_set = state.available if self.config.has_fixed_set else None
-        rows = table if self.fixed_set is None else table[self.fixed_set.ids]
-        self.projected = rollout.project(params, rows)
-        if self.fixed_set is None:
+        self.projected = rollout.project(params, actions.offered(state.available))
+        self.fixed_set = state.available
+        if not actions.is_fixed:
             self.set_ids = np.array(state.available.ids)
             self.mask = np.asarray(state.available.mask)
-            self.next_ids = np.asarray(rollout.draw_next(key_sets, pool).ids)
+            self.next_ids = np.asarray(rollout.draw_next(key_sets, actions).ids)
             self.all_ids = np.zeros_like(self.next_ids)
 
     def rows(self, half: int) -> slice:
@@ -272,7 +311,7 @@ class _Run:
     def _act(self, t: int, half: int) -> None:
         start = time.perf_counter()
         rows = self.rows(half)
-        if self.fixed_set is None:
+        if not self.actions.is_fixed:
             self.all_ids[t, rows] = self.set_ids[rows]
         acting = self._in_blocks(rows, partial(self._act_in, t))
         self.record.acting[t].append(acting)
@@ -281,12 +320,12 @@ class _Run:
 
     def _act_in(self, t: int, envs: np.ndarray) -> Acting:
         available = self.fixed_set
-        if available is None:
+        if not self.actions.is_fixed:
             available = self._sets(self.set_ids[envs], self.mask[envs])
         acting: Acting = self.rollout.act(
             self.params,
             self.projected,
-            self.table,
+            self.actions,
             self.key,
             np.int32(t),
             envs.astype(np.int32),
@@ -303,7 +342,7 @@ class _Run:
         done = self.record.receive(t, rows, step)
         if self.config.bootstraps_time_limits and np.any(step.truncated):
             self.record.final_value[t, rows] = self._final_value(t, rows, step)
-        if self.fixed_set is None:
+        if not self.actions.is_fixed:
             self.set_ids[rows] = np.where(done[:, None], self.next_ids[t, rows], self.set_ids[rows])
 
     def _final_value(self, t: int, rows: slice, step: HostStep) -> np.ndarray:
@@ -338,7 +377,7 @@ class _Run:
         next_value = np.concatenate([acting.value[1:], last_value[None]])
         fields: dict[str, Any] = {
             "observation": record.frames[:-1],
-            "available": None,
+            "available": self.fixed_set,
             "next_value": np.where(record.done, record.final_value, next_value),
             "reward": record.reward,
             "terminated": record.terminated,
@@ -346,7 +385,7 @@ class _Run:
         }
         if self.has_stacks:
             fields["observation"] = FrameHistory(record.frames[:-1], record.age[:-1])
-        if self.fixed_set is None:
+        if not self.actions.is_fixed:
             fields["available"] = self._sets(self.all_ids, self.mask)
         return RolloutBatch(
             sample=acting.sample,

@@ -174,9 +174,7 @@ class HostEnvironments:
         """Begins an evaluation whose episodes follow from `key`; observations [N, ...]."""
         pool = self.pool
         self._is_new, self._left_in = False, None
-        words = np.asarray(jax.random.key_data(key)).ravel().tolist()
-        seed = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
-        return pool.reset_numbered(int(seed >> np.uint64(1)))
+        return pool.reset_numbered(evaluation_seed(key))
 
     def close(self) -> None:
         """Ends the pool; another one is made if it is needed again."""
@@ -189,3 +187,10 @@ class HostEnvironments:
 
     def __exit__(self, *error: object) -> None:
         self.close()
+
+
+def evaluation_seed(key: jax.Array) -> int:
+    """The seed of `HostPool.reset_numbered` that stands for a key, 0 .. 2^63 - 1."""
+    words = np.asarray(jax.random.key_data(key)).ravel().tolist()
+    seed = np.random.SeedSequence(words).generate_state(1, np.uint64)[0]
+    return int(seed >> np.uint64(1))

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxnew import metrics
-from jaxnew.checkpoint import Checkpointer, Kind
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer, Kind
 
 
 def _record(path: Path, kind: Kind) -> tuple[Checkpointer, Path, list[dict[str, Any]]]:

@@ -11,11 +11,11 @@ from experiments.pipeline.evaluation import file_stem
 from experiments.pipeline.flags import budget_of
 from experiments.reports.runs import Group, group_runs, read_runs
 from experiments.tasks.grid_world import TASK
-from jaxnew import config as config_lib
 from jaxnew.actions import ActionSplit
-from jaxnew.metrics import MetricsLog
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run_directory import RunDirectory
+from jaxnew.storage import config as config_lib
+from jaxnew.storage.metrics import MetricsLog
+from jaxnew.storage.run_directory import RunDirectory
 
 
 def plain_config(

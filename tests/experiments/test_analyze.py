@@ -20,7 +20,7 @@ from experiments.reports.searches import batch_size_sources
 from experiments.reports.studies import STUDIES, encoded_test_actions
 from experiments.reports.study_report import Study, StudyPoint, as_markdown, study_figure
 from experiments.tasks.grid_world import TASK
-from jaxnew import observations
+from jaxnew import collection
 from jaxnew.actions import ActionSplit
 from jaxnew.evaluation import Evaluator
 from jaxnew.representation.table import RepresentationTable
@@ -96,7 +96,7 @@ def test_sizes_ratios_growth_and_recordings(runs: Path) -> None:
 def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> None:
     split = ActionSplit.load(runs / POLICY / "split.json")
     _, learner, state, _ = load_encoder(runs / ENCODER)
-    recordings = observations.load(runs / "recordings-16", universe=TASK.make_universe())
+    recordings = collection.load(runs / "recordings-16", universe=TASK.make_universe())
     rows = recordings.rows(split.test)
     expected = learner.encode(state, recordings.data[rows][:, :4])
     np.testing.assert_array_equal(encoded_test_actions(runs / ENCODER, split, 4), expected)

@@ -23,9 +23,9 @@ from experiments.reports.runs import Group, read_runs
 from experiments.untrained import stacking
 from experiments.untrained.recommender import rates
 from experiments.untrained.stacking import StackingAnchor
-from jaxnew import config as config_lib
 from jaxnew.policy import Categorical
 from jaxnew.sampling import AvailableSet
+from jaxnew.storage import config as config_lib
 from tests.experiments.commands import run
 from tests.experiments.handwritten import plain_config, write_run
 

@@ -12,7 +12,7 @@ import pytest
 from envs_mjx.grid_world import skill_universe
 from experiments.pipeline.artifacts import Domain, find_table
 from experiments.pipeline.flags import load_task
-from jaxnew import observations
+from jaxnew import collection
 from jaxnew.actions import SplitMismatch
 from jaxnew.representation.table import RepresentationTable
 from tests.experiments.commands import run
@@ -180,7 +180,7 @@ def test_damaged_recordings_are_found(tmp_path: Path) -> None:
     content[-5] ^= 0xFF
     file.write_bytes(content)
     with pytest.raises(observations.ObservationsError, match="1023"):
-        observations.load(file.parent, skill_universe())
+        collection.load(file.parent, skill_universe())
     output = run("collect", "--budget=smoke", f"--runs={tmp_path}")
     assert "1024 actions x 16 recordings" in output
-    observations.load(file.parent, skill_universe())
+    collection.load(file.parent, skill_universe())

@@ -17,9 +17,10 @@ import pytest
 
 from experiments.pipeline.artifacts import Domain
 from experiments.pipeline.flags import load_task
-from jaxnew import metrics, observations
-from jaxnew.checkpoint import Checkpointer
+from jaxnew import collection
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
 from tests.experiments.several import run_several
 
@@ -109,7 +110,7 @@ def test_new_actions_are_recorded_encoded_and_acted_with(
     """Paper algorithm 2 from recordings to episodes, with nothing trained."""
     domain = Domain.of(load_task("grid_world"), None)
     ids = domain.split.test[:64]
-    recorded = observations.collect(
+    recorded = collection.collect(
         tmp_path / "recordings",
         domain.play.record_block,
         format=domain.play.format,
@@ -119,7 +120,7 @@ def test_new_actions_are_recorded_encoded_and_acted_with(
         seed=7,
         block_actions=64,
     )
-    observations.save_npz(tmp_path / "new.npz", recorded)
+    recorded.save(tmp_path / "new.npz")
     table_file = tmp_path / "new_table.npz"
     output = run(
         "embed",

@@ -26,10 +26,10 @@ from envs_host.create.tools import (
     tool_universe,
 )
 from experiments.tasks.create import LEVELS
-from jaxnew import metrics
 from jaxnew.actions import ActionSplit
-from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from tests.experiments.commands import read_json
 from tests.experiments.create_probes import acted
 from tests.experiments.create_runs import parameters

@@ -22,8 +22,8 @@ from experiments.reports.production import Cell, Source, find
 from experiments.reports.runs import Group, read_runs
 from experiments.reports.study_report import Study, StudyPoint, as_csv, as_markdown, study_figure
 from experiments.tasks.create import LEVELS
-from jaxnew import config as config_lib
 from jaxnew.representation.table import RepresentationTable, engineered_table
+from jaxnew.storage import config as config_lib
 from tests.experiments.handwritten import plain_config, write_evaluation, write_run
 
 OURS = Cell("ours", "hvae")

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxnew import metrics
-from jaxnew.checkpoint import Checkpointer
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from tests.experiments.commands import ENVIRONMENT, ROOT, read_json
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several

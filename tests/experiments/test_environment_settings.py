@@ -13,9 +13,9 @@ from experiments.pipeline.artifacts import Domain
 from experiments.pipeline.flags import UsageError, load_task
 from experiments.pipeline.machinery import with_environment_settings
 from experiments.pipeline.training import TrainConfig, Trainer
-from jaxnew import config as config_lib
-from jaxnew.config import ConfigError
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage import config as config_lib
+from jaxnew.storage.config import ConfigError
 from jaxnew.task import Task
 
 pytestmark = pytest.mark.unit

@@ -39,10 +39,10 @@ from experiments.reports.plots import (
 from experiments.reports.results import as_markdown, result_rows
 from experiments.reports.runs import read_runs
 from experiments.tasks.grid_world import TASK
-from jaxnew.checkpoint import Checkpointer
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run_directory import RunDirectory
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.run_directory import RunDirectory
 from tests.experiments import commands
 from tests.experiments.handwritten import (
     a_split,

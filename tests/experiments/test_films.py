@@ -34,11 +34,11 @@ from experiments.reports.plots import Metric
 from experiments.reports.production import Cell, Source, find
 from experiments.reports.runs import read_runs
 from experiments.reports.searches import GRIDS, chosen, search_parts
-from jaxnew import config as config_lib
-from jaxnew.checkpoint import Checkpointer
-from jaxnew.metrics import MetricsLog
 from jaxnew.representation.table import engineered_table
-from jaxnew.run_directory import RunDirectory
+from jaxnew.storage import config as config_lib
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.metrics import MetricsLog
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task import Film
 from tests.experiments.commands import ROOT, read_json
 from tests.experiments.handwritten import plain_config, write_run

@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 from experiments.pipeline.training import load_state, load_trainer
-from jaxnew import metrics
-from jaxnew.checkpoint import Checkpointer
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task import Task
 from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
 from tests.toy_task import TASK

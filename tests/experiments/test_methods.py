@@ -10,7 +10,7 @@ import pytest
 from experiments.pipeline.artifacts import Domain
 from experiments.pipeline.flags import UsageError, load_task
 from experiments.pipeline.methods import VARIANTS, adapted, trained_ids, variant_of
-from jaxnew import metrics
+from jaxnew.storage import metrics
 from tests.experiments.commands import OPTIMIZED, read_json, run
 from tests.experiments.several import run_several
 

@@ -30,9 +30,9 @@ from experiments.reports.production import Cell, Source, find
 from experiments.reports.results import result_rows
 from experiments.reports.runs import read_runs
 from experiments.tasks.grid_world import TASK
-from jaxnew import config as config_lib
-from jaxnew.metrics import MetricsLog
 from jaxnew.representation.table import RepresentationTable, engineered_table
+from jaxnew.storage import config as config_lib
+from jaxnew.storage.metrics import MetricsLog
 from tests.experiments import commands
 from tests.experiments.handwritten import groups_at, plain_config, write_evaluation, write_run
 

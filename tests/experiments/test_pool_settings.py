@@ -10,7 +10,7 @@ import pytest
 from envs_host.pool import PoolSettings
 from experiments.pipeline.flags import UsageError, load_task
 from experiments.pipeline.machinery import pool_assignments, with_pool_settings
-from jaxnew.config import ConfigError
+from jaxnew.storage.config import ConfigError
 from jaxnew.task import HostDomain, Task
 from tests.toy_task import TASK as TOY
 

@@ -16,9 +16,9 @@ from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_univer
 from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
 from experiments.pipeline.artifacts import REPRESENTATION_SEED
 from experiments.pipeline.training import load_trainer
-from jaxnew import metrics
-from jaxnew.checkpoint import Checkpointer
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from tests.experiments import stacking_runs as stacking
 from tests.experiments.commands import read_json
 from tests.experiments.create_runs import parameters, saved, timeless

@@ -20,10 +20,11 @@ from experiments.pipeline.artifacts import (
 )
 from experiments.pipeline.flags import UsageError, load_task
 from experiments.pipeline.recordings import collect
-from jaxnew import metrics, observations
-from jaxnew.checkpoint import Checkpointer
+from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.representation.sources import DrawnRecordings, StoredRecordings
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer
 from tests import video_task
 from tests.experiments.commands import read_json, run
 
@@ -126,8 +127,8 @@ def test_the_frozen_encoder_reads_frames(runs: Path, tmp_path: Path) -> None:
     own = RepresentationTable.load(encoder / "table.npz")
     np.testing.assert_allclose(new.vectors, own.vectors, atol=1e-6)
     np.savez(tmp_path / "poses.npz", ids=np.array([1]), recordings=np.zeros((1, 2, 2, 4, 3)))
-    with pytest.raises(observations.ObservationsError, match=r"expected \(1, 2, 2, 48, 48, 1\)"):
-        observations.load_npz(tmp_path / "poses.npz", video_task.VIDEO.seen)
+    with pytest.raises(ObservationsError, match=r"expected \(1, 2, 2, 48, 48, 1\)"):
+        Recordings.load(tmp_path / "poses.npz").fits(video_task.VIDEO.seen)
 
 
 def simulated(num_recordings: int) -> np.ndarray:
@@ -177,7 +178,7 @@ def test_stored_frames_are_gone_on_with_and_belong_to_their_poses(tmp_path: Path
     assert again.drawn is not None
     assert again.drawn.hash == before
     shutil.rmtree(tmp_path / "poses-1")
-    with pytest.raises(observations.ObservationsError, match="drawn_from"):
+    with pytest.raises(ObservationsError, match="drawn_from"):
         collect(tmp_path, video_task.VIDEO, domain.universe, 1, 10, stores_drawn=True)
 
 

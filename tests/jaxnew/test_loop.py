@@ -24,9 +24,10 @@ import optax
 import pytest
 from flax import struct
 
-from jaxnew import loop, metrics
-from jaxnew.checkpoint import Checkpointer, CheckpointError
-from jaxnew.run_directory import RunDirectory
+from jaxnew import loop
+from jaxnew.storage import metrics
+from jaxnew.storage.checkpoint import Checkpointer, CheckpointError
+from jaxnew.storage.run_directory import RunDirectory
 
 ROOT = Path(__file__).resolve().parents[2]
 SETTINGS: dict[str, Any] = {

@@ -12,7 +12,7 @@ from envs_host.create.play import PlayConfig, record_block, record_images, recor
 from envs_host.create.poses import draw_poses, record_poses
 from envs_host.create.recorder import PoolRecorder, Recorder
 from envs_host.create.tools import ToolClass, all_tools, no_op_id
-from jaxnew import observations
+from jaxnew import collection
 from jaxnew.actions import ActionUniverse
 from jaxnew.observations import RecordingFormat
 
@@ -104,8 +104,8 @@ def test_poses_are_collected_and_gone_on_with(tmp_path: Path) -> None:
             raise KeyboardInterrupt
         return record_poses(seed, ids, num_recordings)
 
-    def collect(path: Path) -> observations.ActionObservations:
-        return observations.collect(
+    def collect(path: Path) -> observations.Recordings:
+        return collection.collect(
             path,
             record,
             format=RecordingFormat("poses", create_poses.POSES_SHAPE, "float64"),

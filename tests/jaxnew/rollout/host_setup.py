@@ -11,13 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.environment import ActionSpec
-from jaxnew.metrics import TIME_PREFIX
 from jaxnew.policy import make_method
 from jaxnew.policy.method import MethodContext
 from jaxnew.rollout.device import RolloutConfig
 from jaxnew.rollout.host import HostRollout
 from jaxnew.rollout.pool import HostEnvironments
 from jaxnew.sampling import ActionPool
+from jaxnew.storage.metrics import TIME_PREFIX
 from tests import toy_host
 from tests.jaxnew.policy import numpy_policy
 

@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.checkpoint import Checkpointer
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.ppo.host import HostLearner
 from jaxnew.rollout.frames import FrameHistory
 from jaxnew.rollout.host import HostRollout
 from jaxnew.rollout.pool import HostEnvironments
+from jaxnew.storage.checkpoint import Checkpointer
 from tests import toy_host
 from tests.jaxnew.rollout.host_setup import (
     CONFIG,

@@ -8,8 +8,21 @@ import json
 import os
 import platform
 import tempfile
+import zipfile
+import zlib
 from pathlib import Path
 from typing import Any
+
+# All that `numpy.load` was seen to raise on missing, cut or foreign files.
+UNREADABLE_NPZ = (
+    OSError,
+    ValueError,
+    EOFError,
+    AttributeError,
+    TypeError,
+    zipfile.BadZipFile,
+    zlib.error,
+)
 
 
 def sync_folder(folder: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnew.config import ConfigError, differences, from_dict, set_path, set_paths, to_dict
+from jaxnew.storage.config import ConfigError, differences, from_dict, set_path, set_paths, to_dict
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,7 @@
-"""What `--method` names: a policy of `jaxnew.policy` with the settings it is trained with.
+"""What a method is: a policy of `jaxnew.policy` with the settings it is trained with.
 
-Spec method 8 lists what each baseline and ablation changes; everything else is as for ours.
+What each baseline and ablation changes stands in `docs/method.md`, "Baselines and ablations";
+everything else is as for ours.
 """
 
 from __future__ import annotations
@@ -11,11 +12,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from experiments.pipeline.flags import UsageError, load_place
 from jaxnew.actions import ActionSplit
 from jaxnew.environment import ActionSpec
 from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method
-from jaxnew.task import StageTwoBudget, Task
+from jaxnew.task.budgets import StageTwoBudget
+from jaxnew.task.places import UsageError, load_place
+from jaxnew.task.task import Task
 
 _FIXED_SET_NUMBERS = 2**14  # Scored action and state pairs per microbatch that stay in the caches.
 
@@ -104,10 +106,10 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
     """The budget of a task as a method spends it."""
     variant = variant_of(name)
     ppo, hyperparameters = budget.ppo, budget.hyperparameters
-    rollout = replace(ppo.rollout, has_fixed_set=variant.has_fixed_set)
     if variant.is_continuous:
         share = task.baselines.continuous_rollout_share
-        rollout = replace(rollout, num_steps=round(rollout.num_steps * share))
+        num_steps = round(ppo.rollout.num_steps * share)
+        ppo = replace(ppo, rollout=replace(ppo.rollout, num_steps=num_steps))
         budget = replace(budget, num_updates=round(budget.num_updates / share))
     if variant.scores_fixed_set and ppo.microbatch_size:
         wanted = _FIXED_SET_NUMBERS // len(trained_ids(name, task, split))
@@ -117,7 +119,8 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
         ppo = replace(ppo, num_minibatches=task.baselines.fixed_set_minibatches)
     if variant.is_without_entropy:
         hyperparameters = replace(hyperparameters, entropy_coefficient=0.0)
-    return replace(budget, ppo=replace(ppo, rollout=rollout), hyperparameters=hyperparameters)
+    sets = replace(budget.sets, is_fixed=variant.has_fixed_set)
+    return replace(budget, ppo=ppo, sets=sets, hyperparameters=hyperparameters)
 
 
 def method_of(

@@ -14,7 +14,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnew.metrics import (
+from jaxnew.storage.metrics import (
     FILE_NAME,
     MetricsError,
     MetricsLog,

@@ -1,4 +1,4 @@
-"""Metrics of a run as JSON lines and TensorBoard events, and confidence intervals."""
+"""Metrics of a run as JSON lines and TensorBoard events."""
 
 from __future__ import annotations
 
@@ -7,15 +7,12 @@ import math
 import os
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
-import numpy as np
-
-from jaxnew._files import write_bytes_atomically
+from jaxnew.storage.files import write_bytes_atomically
 
 FILE_NAME = "metrics.jsonl"
 TIME_PREFIX = "time/"  # Wall-clock fields; all others are reproduced exactly by a resumed run.
-_Z_95 = 1.959963984540054
 
 
 class MetricsError(ValueError):
@@ -147,48 +144,3 @@ class MetricsLog:
             return
         purge_step = self._last_step + 1 if self._last_step >= 0 else None
         self._events = SummaryWriter(str(self._folder / "tensorboard"), purge_step=purge_step)
-
-
-class Interval(NamedTuple):
-    """An estimate with a 95 % confidence interval."""
-
-    mean: float
-    low: float
-    high: float
-
-
-def wilson_interval(successes: int, trials: int) -> Interval:
-    """Wilson's 95 % score interval for a proportion: inside [0, 1], sound for rare events.
-
-    Raises:
-      ValueError: not 0 <= successes <= trials, or no trial.
-    """
-    if trials < 1 or not 0 <= successes <= trials:
-        raise ValueError(
-            f"A proportion needs trials >= 1 and 0 <= successes <= trials, got {successes} of "
-            f"{trials}."
-        )
-    share, z2 = successes / trials, _Z_95**2
-    centre = (share + z2 / (2 * trials)) / (1 + z2 / trials)
-    half = _Z_95 * math.sqrt(share * (1 - share) / trials + z2 / (4 * trials**2))
-    half /= 1 + z2 / trials
-    low = 0.0 if successes == 0 else max(0.0, centre - half)
-    return Interval(share, low, 1.0 if successes == trials else min(1.0, centre + half))
-
-
-def mean_interval(values: np.ndarray) -> Interval:
-    """Mean with its normal 95 % interval, `mean +- 1.96 s / sqrt(n)`; no width for one value.
-
-    Args:
-      values: f[n], n >= 1, independent (episodes of one policy, or one number per seed).
-
-    Raises:
-      ValueError: `values` is not a non-empty vector.
-    """
-    values = np.asarray(values, np.float64)
-    if values.ndim != 1 or values.size == 0:
-        raise ValueError(f"Need a non-empty vector of values, got shape {values.shape}.")
-    mean = float(values.mean())
-    spread = float(values.std(ddof=1)) if values.size > 1 else 0.0
-    half = _Z_95 * spread / math.sqrt(values.size)
-    return Interval(mean, mean - half, mean + half)

@@ -1,4 +1,9 @@
-"""Collecting recordings into a directory, whatever kills the process meanwhile. NumPy only."""
+"""Collecting recordings of actions into a directory, whatever kills the process meanwhile.
+
+NumPy only. A recording directory holds `recordings.npy`, all recordings as one memory-mapped array,
+and `manifest.json`: what they are and the hash of each finished action. An action counts only once
+its hash is in the manifest, so collecting can be killed at any instant and goes on later.
+"""
 
 from __future__ import annotations
 
@@ -9,33 +14,32 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from jaxnew._files import take_lock, write_json_atomically
-from jaxnew._progress import ProgressDisplay
-from jaxnew._recordings import (
-    DATA,
-    FORMAT_VERSION,
-    KIND,
-    MANIFEST,
+from jaxnew.actions import ActionUniverse, content_hash
+from jaxnew.observations import (
     ObservationsError,
     RecordingFormat,
+    Recordings,
     checked_ids,
-    manifest_hash,
-    open_data,
-    read_manifest,
     row_hash,
 )
-from jaxnew.actions import ActionUniverse, content_hash
-from jaxnew.config import differences
+from jaxnew.storage.config import differences
+from jaxnew.storage.files import take_lock, write_json_atomically
+from jaxnew.storage.progress import ProgressDisplay
+
+KIND = "jaxnew action recordings"
+FORMAT_VERSION = 1
+MANIFEST = "manifest.json"
+DATA = "recordings.npy"
 
 RecordBlock = Callable[[int, np.ndarray, int], np.ndarray]
 
 
-def collect_into(
-    path: Path,
+def collect(
+    path: Path | str,
     record_block: RecordBlock,
     *,
     format: RecordingFormat,
@@ -44,15 +48,34 @@ def collect_into(
     num_recordings: int,
     seed: int,
     block_actions: int,
-    play_settings: Mapping[str, Any],
-) -> None:
-    """See `jaxnew.observations.collect`."""
+    play_settings: Mapping[str, Any] | None = None,
+) -> Recordings:
+    """Records actions into the directory `path`; goes on where an earlier call was killed.
+
+    Says how large the result will be, and shows progress. Where another process collects there, it
+    waits. Calling it again when everything is recorded only checks the recordings; damaged ones are
+    made again.
+
+    Args:
+      record_block: `(seed, ids int32[n], num_recordings) -> [n, num_recordings, *format.shape]`,
+        n always the same. The recordings of an id must depend on `seed`, the id and
+        `num_recordings` only, not on the other ids (`action_rng`; `jax.random.fold_in(key, id)`):
+        then the result does not depend on `block_actions`, nor on where a killed call stopped.
+      ids: int[A] actions to record, in the order of the rows.
+      block_actions: actions per call of `record_block` (at most A); only a matter of speed.
+      play_settings: plain JSON; whatever else fixes the recordings, e.g. environment parameters.
+
+    Raises:
+      ObservationsError: `path` holds something else or recordings with other settings, the disk is
+        too small, or `record_block` broke its promise.
+    """
+    path = Path(path)
     ids = checked_ids(ids, universe, "collect")
     if num_recordings < 1 or block_actions < 1:
         raise ObservationsError(
             f"num_recordings={num_recordings} and block_actions={block_actions} must be at least 1."
         )
-    settings = _settings(format, universe, ids, num_recordings, seed, play_settings)
+    settings = _settings(format, universe, ids, num_recordings, seed, play_settings or {})
     path.mkdir(parents=True, exist_ok=True)
     if not (path / MANIFEST).exists() and any(
         not name.startswith(".") for name in os.listdir(path)
@@ -67,6 +90,48 @@ def collect_into(
         )
     finally:
         os.close(lock)
+    return load(path, universe, verify=False)
+
+
+def load(path: Path | str, universe: ActionUniverse, verify: bool = True) -> Recordings:
+    """Opens recordings without reading them into memory.
+
+    Args:
+      universe: must be the one whose actions were recorded.
+      verify: read every recording once, to compare its hash and check its values.
+
+    Raises:
+      ObservationsError: there are none, they are unfinished or damaged, or they belong to another
+        universe.
+    """
+    path = Path(path)
+    manifest = read_manifest(path)
+    settings = manifest["settings"]
+    recorded = settings["universe"]
+    if recorded["hash"] != universe.hash:
+        raise ObservationsError(
+            f"{path} holds recordings of universe {recorded['name']} {recorded['hash']}, asked for "
+            f"was {universe.name} {universe.hash}. Collect the actions of this universe."
+        )
+    hashes = manifest["action_hashes"]
+    if None in hashes:
+        raise ObservationsError(
+            f"{path} is unfinished: {len(hashes) - hashes.count(None)} of {len(hashes)} actions "
+            "are recorded. Run collect again with the same settings to go on."
+        )
+    format = RecordingFormat(**{**settings["format"], "shape": tuple(settings["format"]["shape"])})
+    ids = checked_ids(np.array(manifest["ids"]), universe, str(path))
+    data = open_data(path, format, (len(ids), settings["num_recordings"], *format.shape))
+    for row in range(len(ids) if verify else 0):
+        problem = format.problem(data[row], data.shape[1:], True)
+        if problem is None and row_hash(data[row]) != hashes[row]:
+            problem = "has other bytes than were recorded"
+        if problem is not None:
+            raise ObservationsError(
+                f"{path}: the recording of action {ids[row]} {problem}. Run collect again to "
+                "repair it."
+            )
+    return Recordings(data, ids, format, universe.hash, tuple(hashes))
 
 
 def _wait_for_lock(path: Path) -> int:
@@ -214,3 +279,47 @@ class _Collection:
         }
         manifest["hash"] = manifest_hash(manifest)
         write_json_atomically(self._path / MANIFEST, manifest)
+
+
+def manifest_hash(manifest: dict[str, Any]) -> str:
+    """Hash of a manifest without its own `hash` entry."""
+    return str(content_hash(json.dumps(manifest, sort_keys=True)))
+
+
+def read_manifest(path: Path) -> dict[str, Any]:
+    """The manifest of the recording directory `path`, checked to be whole and of this format."""
+    try:
+        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        kind, version = manifest["kind"], manifest["format_version"]
+        if kind != KIND or version != FORMAT_VERSION:
+            raise ObservationsError(
+                f"{path} holds {kind!r} of format {version}; this program reads {KIND!r} of "
+                f"format {FORMAT_VERSION}. Collect again in another directory."
+            )
+        recorded_hash = manifest.pop("hash")
+        if manifest_hash(manifest) != recorded_hash:
+            raise KeyError("it does not have the hash recorded in it")
+    except FileNotFoundError as err:
+        raise ObservationsError(
+            f"{path} has no {MANIFEST}: there are no recordings. Run collect first."
+        ) from err
+    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as err:
+        raise ObservationsError(
+            f"{path / MANIFEST} is damaged ({err!r}). Restore it from a copy, or delete the "
+            "directory and collect again."
+        ) from err
+    return dict(manifest)
+
+
+def open_data(path: Path, format: RecordingFormat, shape: tuple[int, ...]) -> np.memmap:
+    """The memory-mapped recordings, read-only, with the right shape and dtype."""
+    try:
+        data = np.load(path / DATA, mmap_mode="r", allow_pickle=False)
+    except (OSError, ValueError, EOFError) as err:
+        raise ObservationsError(
+            f"{path / DATA} is missing or damaged ({err}). Run collect again to repair it."
+        ) from err
+    problem = format.problem(data, shape, False)
+    if problem is not None:
+        raise ObservationsError(f"{path / DATA} {problem}. Run collect again to repair it.")
+    return cast(np.memmap, data)

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from jaxnew import run_directory as run_directory_lib
-from jaxnew._files import write_json_atomically
-from jaxnew.run_directory import (
+from jaxnew.storage import run_directory as run_directory_lib
+from jaxnew.storage.files import write_json_atomically
+from jaxnew.storage.run_directory import (
     ConfigMismatch,
     RunDirectory,
     RunDirectoryError,
@@ -230,7 +230,7 @@ def test_the_lock_holds_within_a_process_and_is_released(tmp_path: Path) -> None
 
 HOLDER = """
 import sys, time
-from jaxnew.run_directory import RunDirectory
+from jaxnew.storage.run_directory import RunDirectory
 run = RunDirectory.open_or_create(sys.argv[1], {"seed": 1})
 print("locked", flush=True)
 time.sleep(60)

@@ -16,7 +16,7 @@ import optax
 import pytest
 from flax import struct
 
-from jaxnew.checkpoint import Checkpointer, CheckpointError, record_hash
+from jaxnew.storage.checkpoint import Checkpointer, CheckpointError, record_hash
 
 
 @struct.dataclass

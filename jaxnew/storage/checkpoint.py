@@ -18,13 +18,14 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxnew import _leaves
-from jaxnew._files import sync_folder
+from jaxnew.storage.files import sync_folder
 
 State = TypeVar("State")
+Leaf = dict[str, Any]  # Path, shape, dtype and hash of a leaf, as plain JSON.
 Kind = Literal["latest", "best"]
 KINDS: tuple[Kind, ...] = ("latest", "best")
 _KEEP = {"latest": 2, "best": 3}
@@ -87,9 +88,7 @@ class Checkpointer:
                 f"{existing[-1] if existing else '(none)'}. Steps must grow; call discard_after "
                 "when a run goes back to an earlier step."
             )
-        leaves = [
-            _leaves.describe_with_content(name, leaf) for name, leaf in _leaves.named_leaves(state)
-        ]
+        leaves = [describe_with_content(name, leaf) for name, leaf in named_leaves(state)]
         record: dict[str, Any] = {
             "format_version": _FORMAT_VERSION,
             "step": step,
@@ -192,11 +191,11 @@ class Checkpointer:
 
     def _read(self, path: Path, example: Any, is_part: bool) -> tuple[Any, dict[str, Any]]:
         record = self._read_record(path)
-        leaves, saved = _leaves.named_leaves(example), record["leaves"]
+        leaves, saved = named_leaves(example), record["leaves"]
         names = {name for name, _ in leaves}
-        difference = _leaves.first_difference(
+        difference = first_difference(
             [leaf for leaf in saved if not is_part or leaf["path"] in names],
-            [_leaves.describe(name, leaf) for name, leaf in leaves],
+            [describe_leaf(name, leaf) for name, leaf in leaves],
         )
         if difference is not None:
             raise CheckpointError(
@@ -205,10 +204,10 @@ class Checkpointer:
             )
         pairs = zip(self._read_values(path, saved), saved, strict=True)
         found = {description["path"]: (value, description) for value, description in pairs}
-        restored = [_leaves.restore(*found[name], leaf) for name, leaf in leaves]
+        restored = [restore_leaf(*found[name], leaf) for name, leaf in leaves]
         return jax.tree.unflatten(jax.tree.structure(example), restored), record["metadata"]
 
-    def _read_values(self, path: Path, saved: list[_leaves.Leaf]) -> list[np.ndarray]:
+    def _read_values(self, path: Path, saved: list[Leaf]) -> list[np.ndarray]:
         values = [np.zeros(leaf["stored"][1], np.dtype(leaf["stored"][0])) for leaf in saved]
         target = {str(i): value for i, value in enumerate(values) if value.size}
         if target:
@@ -221,7 +220,7 @@ class Checkpointer:
             for name, value in found.items():
                 values[int(name)] = np.asarray(value)
         for leaf, value in zip(saved, values, strict=True):
-            if _leaves.sha256(value) != leaf["sha256"]:
+            if sha256(value) != leaf["sha256"]:
                 raise _DamagedError(
                     f"the bytes of leaf {leaf['path']} are not those that were saved"
                 )
@@ -248,3 +247,97 @@ class Checkpointer:
         for name in os.listdir(folder):
             if name.startswith(("new-", "old-")):
                 shutil.rmtree(folder / name, ignore_errors=True)
+
+
+def is_key(leaf: Any) -> bool:
+    """Whether a leaf is an array of typed PRNG keys, concrete or abstract."""
+    return hasattr(leaf, "dtype") and jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key)
+
+
+def named_leaves(state: Any) -> list[tuple[str, Any]]:
+    """(path, leaf) of each leaf, in JAX's order; the path looks like `.params['w'][0]`."""
+    leaves, _ = jax.tree_util.tree_flatten_with_path(state)
+    return [(jax.tree_util.keystr(path) or "(state)", leaf) for path, leaf in leaves]
+
+
+def describe_leaf(name: str, leaf: Any) -> Leaf:
+    """Path, shape and dtype of a leaf; `dtype` is `key<...>` for typed PRNG keys.
+
+    Raises:
+      TypeError: the leaf is neither an array nor a number.
+    """
+    if is_key(leaf):
+        return {"path": name, "shape": list(leaf.shape), "dtype": str(leaf.dtype)}
+    # NumPy's float64 is a Python float too; it is described as an array.
+    if isinstance(leaf, bool | int | float | complex) and not isinstance(leaf, np.generic):
+        return {"path": name, "shape": [], "dtype": f"Python {type(leaf).__name__}"}
+    if not hasattr(leaf, "dtype") or not hasattr(leaf, "shape"):
+        raise TypeError(
+            f"Leaf {name} of the state is a {type(leaf).__name__}; checkpoints hold arrays, PRNG "
+            "keys and numbers. Keep anything else out of the state or mark it as static."
+        )
+    return {"path": name, "shape": list(leaf.shape), "dtype": str(np.dtype(leaf.dtype))}
+
+
+def describe_with_content(name: str, leaf: Any) -> tuple[Leaf, np.ndarray]:
+    """`describe_leaf` with what restoring needs, and the bits of the leaf as a NumPy array."""
+    description = describe_leaf(name, leaf)
+    value = np.asarray(jax.random.key_data(leaf) if is_key(leaf) else leaf)
+    description["stored"] = [str(value.dtype), list(value.shape)]
+    description["sha256"] = sha256(value)
+    if is_key(leaf):
+        description["impl"] = str(jax.random.key_impl(leaf))
+    return description, value
+
+
+def sha256(value: np.ndarray) -> str:
+    """Hash of the bytes of an array."""
+    return hashlib.sha256(np.ascontiguousarray(value).tobytes()).hexdigest()
+
+
+def restore_leaf(value: np.ndarray, description: Leaf, example: Any) -> Any:
+    """`value` as the kind of leaf that `example` is, and on its device if it was put on one."""
+    if isinstance(example, np.generic):
+        return value[()]
+    if isinstance(example, bool | int | float | complex):
+        return type(example)(value.item())
+    if isinstance(example, np.ndarray):
+        return value
+    if is_key(example):
+        restored = jax.random.wrap_key_data(jnp.asarray(value), impl=description["impl"])
+    else:
+        restored = jnp.asarray(value)
+        if isinstance(example, jax.Array) and example.weak_type:
+            # A strongly typed copy would be another argument type, hence another compilation.
+            restored = example.at[...].set(restored)
+    sharding = getattr(example, "sharding", None)
+    is_placed = getattr(example, "committed", sharding is not None)
+    return jax.device_put(restored, sharding) if is_placed else restored
+
+
+def first_difference(saved: list[Leaf], expected: list[Leaf]) -> str | None:
+    """Says which leaf differs first in path, shape or dtype, or None if all agree."""
+    saved_by_path = {leaf["path"]: leaf for leaf in saved}
+    for leaf in expected:
+        twin = saved_by_path.pop(leaf["path"], None)
+        if twin is None or not _is_same_leaf(twin, leaf):
+            found = "absent" if twin is None else _show(twin)
+            return f"leaf {leaf['path']} is {found} in the checkpoint, expected {_show(leaf)}"
+    for leaf in saved_by_path.values():
+        return f"leaf {leaf['path']} ({_show(leaf)}) of the checkpoint is not expected"
+    return None
+
+
+def _show(leaf: Leaf) -> str:
+    return f"{leaf['dtype']}{leaf['shape']}"
+
+
+def _is_same_leaf(saved: Leaf, expected: Leaf) -> bool:
+    if saved["shape"] != expected["shape"]:
+        return False
+    is_exact = bool(saved["dtype"] == expected["dtype"])
+    if not expected["dtype"].startswith("Python ") or saved["dtype"].startswith(("Python", "key<")):
+        return is_exact
+    # A counter may start as a Python number and come back from a jitted chunk as a scalar array.
+    kinds = {"b": "bool", "i": "int", "u": "int", "f": "float", "c": "complex"}
+    return f"Python {kinds.get(np.dtype(saved['dtype']).kind)}" == str(expected["dtype"])

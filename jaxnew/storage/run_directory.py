@@ -9,23 +9,29 @@ figures/  evaluation/*.json
 
 from __future__ import annotations
 
+import contextlib
+import datetime
+import importlib.metadata
 import json
 import os
+import platform
 import re
 import shutil
+import subprocess
+import sys
 import tempfile
 import weakref
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Self
 
-from jaxnew._files import sync_folder, take_lock, write_json_atomically
-from jaxnew._provenance import describe_session
-from jaxnew.config import Difference, differences
+from jaxnew.storage.config import Difference, differences
+from jaxnew.storage.files import sync_folder, take_lock, write_json_atomically
 
 _KIND = "jaxnew run directory"
 _FORMAT_VERSION = 1
 _LOCK = ".lock"
+_PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint", "mujoco", "pymunk")
 _FOLDERS = ("tensorboard", "checkpoints", "figures", "evaluation")
 
 
@@ -109,6 +115,7 @@ class RunDirectory:
         config: Mapping[str, Any],
         overwrite: bool = False,
         extra_provenance: Mapping[str, Any] | None = None,
+        upgrade: Callable[[Mapping[str, Any]], Mapping[str, Any]] = dict,
     ) -> RunDirectory:
         """Opens the run of `config` for writing; makes it where there is none.
 
@@ -118,6 +125,7 @@ class RunDirectory:
           config: plain JSON, e.g. of `config.to_dict`.
           overwrite: replace an existing run. It is deleted after the new one is in place.
           extra_provenance: recorded with this session, e.g. hashes of the split and the table.
+          upgrade: a recorded configuration in today's form, to be compared with `config`.
 
         Raises:
           ConfigMismatch: the run there has another configuration.
@@ -133,7 +141,7 @@ class RunDirectory:
         elif overwrite:
             run = cls(path, plain, False, _replace(path, plain))
         else:
-            run = _resume(cls, path, plain)
+            run = _resume(cls, path, plain, upgrade)
         try:
             if overwrite:
                 shutil.rmtree(_aside(path), ignore_errors=True)
@@ -235,9 +243,14 @@ def _check_marker(path: Path) -> None:
         )
 
 
-def _resume(cls: type[RunDirectory], path: Path, config: dict[str, Any]) -> RunDirectory:
+def _resume(
+    cls: type[RunDirectory],
+    path: Path,
+    config: dict[str, Any],
+    upgrade: Callable[[Mapping[str, Any]], Mapping[str, Any]],
+) -> RunDirectory:
     _check_marker(path)
-    found = differences(_read_object(path / "config.json"), config)
+    found = differences(upgrade(_read_object(path / "config.json")), config)
     if found:
         raise ConfigMismatch(path, found)
     return cls(path, config, True, _lock(path))
@@ -295,3 +308,51 @@ def _replace(path: Path, config: dict[str, Any]) -> int:
             _restore_interrupted_overwrite(path)
     finally:
         os.close(old_lock)
+
+
+def _git(*arguments: str) -> str | None:
+    """Output of a git command in the folder of this file, or None where there is no answer."""
+    command = ["git", "-C", str(Path(__file__).resolve().parent), *arguments]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return done.stdout.strip()
+
+
+def _revision() -> dict[str, Any] | None:
+    """Revision of the source that runs and whether it was edited; None outside its repository."""
+    if _git("ls-files", "--error-unmatch", Path(__file__).name) is None:
+        return None
+    revision, status = _git("rev-parse", "HEAD"), _git("status", "--porcelain")
+    return None if revision is None else {"git": revision, "is_dirty": bool(status)}
+
+
+def _versions() -> dict[str, str]:
+    versions = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
+            versions[package] = importlib.metadata.version(package)
+    return versions
+
+
+def describe_session() -> dict[str, Any]:
+    """What runs now: start time, command line, revision, versions, devices, float precision.
+
+    Devices and precision are those of jax and are None in a process that has not imported it.
+    """
+    jax = sys.modules.get("jax")
+    return {
+        "started": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "command": list(sys.orig_argv),
+        "revision": _revision(),
+        "versions": _versions(),
+        "machine": {"platform": platform.platform(), "num_cpus": os.cpu_count()},
+        "devices": None if jax is None else [f"{d.platform}: {d}" for d in jax.devices()],
+        "precision": None
+        if jax is None
+        else {
+            "matmul": str(jax.config.jax_default_matmul_precision or "default"),
+            "x64": bool(jax.config.jax_enable_x64),
+        },
+    }

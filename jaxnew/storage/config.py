@@ -19,6 +19,7 @@ from typing import Any, Literal, TypeVar, Union
 
 Config = TypeVar("Config")
 Difference = tuple[str, Any, Any]
+Assignments = Sequence[str] | Mapping[str, Any]
 
 
 class ConfigError(ValueError):
@@ -81,6 +82,10 @@ def _build(annotation: Any, value: Any, path: str) -> Any:
         return _build_union(annotation, options, value, path)
     if dataclasses.is_dataclass(annotation):
         return _build_dataclass(annotation, value, path)
+    if annotation is type(None):
+        if value is not None:
+            raise ConfigError(f"{path} has nothing to set, got {value!r}.")
+        return None
     if typing.get_origin(annotation) is tuple:
         if not isinstance(value, list | tuple):
             raise _wrong_type(path, annotation, value)
@@ -150,10 +155,11 @@ def _build_dataclass(cls: Any, value: Any, path: str) -> Any:
         raise ConfigError(f"{where}: {err}") from err
 
 
-def _plain(value: Any) -> Any:
+def plain(value: Any) -> Any:
+    """The plain form of a configuration, or of a part of one, unchecked."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {name: _plain(getattr(value, name)) for name in _field_types(type(value))}
-    return [_plain(element) for element in value] if isinstance(value, tuple) else value
+        return {name: plain(getattr(value, name)) for name in _field_types(type(value))}
+    return [plain(element) for element in value] if isinstance(value, tuple) else value
 
 
 def to_dict(config: Any) -> dict[str, Any]:
@@ -162,8 +168,8 @@ def to_dict(config: Any) -> dict[str, Any]:
     Raises:
       ConfigError: a value does not have its annotated type, or a float is not finite.
     """
-    checked = _build_dataclass(type(config), _plain(config), "")
-    return typing.cast(dict[str, Any], _plain(checked))
+    checked = _build_dataclass(type(config), plain(config), "")
+    return typing.cast(dict[str, Any], plain(checked))
 
 
 def from_dict(cls: type[Config], plain: Mapping[str, Any]) -> Config:
@@ -246,34 +252,58 @@ def _parse(annotation: Any, text: str, path: str) -> Any:
     return text
 
 
-def set_paths(config: Config, assignments: Sequence[str]) -> Config:
-    """A copy of `config` with every `path.to.field=value` of `assignments` applied at once.
+def set_paths(config: Config, assignments: Assignments) -> Config:
+    """A copy of `config` with every assignment applied at once.
 
-    Text is read by the type of the field: `none` for `X | None`, `64,64` for tuples, `true` and
-    `false` for bools. Fields that are legal only together may be set together.
+    Fields that are legal only together may be set together.
+
+    Args:
+      assignments: `{path.to.field: value}`, or texts `path.to.field=value`. Text is read by the
+        type of the field: `none` for `X | None`, `64,64` for tuples, `true` and `false` for bools.
 
     Raises:
       ConfigError: a path does not exist (names the nearest), a value has the wrong type, or the
         new configuration is refused by a `__post_init__`.
     """
-    plain = to_dict(config)
-    for assignment in assignments:
-        path, equals, text = assignment.partition("=")
-        path = path.strip()
-        if not equals or not path:
-            raise ConfigError(f"{assignment!r} must look like path.to.field=value.")
-        value = _parse(_resolve(config, path), text.strip(), path)
+    tree = to_dict(config)
+    pairs = split_assignments(assignments)
+    for path, value in pairs:
+        annotation = _resolve(config, path)
+        if isinstance(value, str):
+            value = _parse(annotation, value.strip(), path)
         *groups, name = path.split(".")
-        functools.reduce(lambda node, group: node[group], groups, plain)[name] = _plain(value)
+        functools.reduce(lambda node, group: node[group], groups, tree)[name] = plain(value)
     try:
-        return from_dict(type(config), plain)
+        return from_dict(type(config), tree)
     except ConfigError as err:
-        raise ConfigError(f"{' '.join(assignments)}: {err}") from err
+        given = " ".join(f"{path}={value}" for path, value in pairs)
+        raise ConfigError(f"{given}: {err}") from err
 
 
-def set_path(config: Config, assignment: str) -> Config:
-    """`set_paths` with one assignment, e.g. `set_path(config, "ppo.num_envs=64")`."""
-    return set_paths(config, [assignment])
+def split_assignments(assignments: Assignments) -> list[tuple[str, Any]]:
+    """(path, value) of each assignment.
+
+    Raises:
+      ConfigError: a text is not of the form `path=value`.
+    """
+    if isinstance(assignments, Mapping):
+        return [(str(path), value) for path, value in assignments.items()]
+    pairs = []
+    for text in assignments:
+        path, equals, value = text.partition("=")
+        if not equals or not path.strip():
+            raise ConfigError(f"{text!r} must look like path.to.field=value.")
+        pairs.append((path.strip(), value))
+    return pairs
+
+
+def vary(config: Config, changes: Mapping[str, Any]) -> Config:
+    """A copy with some fields changed at once; `group__field` is the path `group.field`.
+
+    Raises:
+      ConfigError: see `set_paths`.
+    """
+    return set_paths(config, {name.replace("__", "."): value for name, value in changes.items()})
 
 
 def differences(old: Any, new: Any, path: str = "") -> list[Difference]:

@@ -1,0 +1,202 @@
+"""Flags of commands: each command defines its own, and those that several have are alike."""
+
+from __future__ import annotations
+
+import os
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from absl import flags, logging
+
+from envs_host.pool import WorkerError
+from jaxnew.task.places import UsageError
+
+# Flags of several commands: kind, default, help.
+_SHARED: dict[str, tuple[str, Any, str]] = {
+    "task": ("string", "grid_world", "Task name, or package.module:TASK."),
+    "method": (
+        "string",
+        "ours",
+        "ours, no-entropy, no-subsampling, continuous, nearest-neighbour, random, or "
+        "package.module:NAME of a callable (MethodContext) -> PolicyMethod.",
+    ),
+    "representation": (
+        "string",
+        "hvae",
+        "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot) "
+        "and -oracle (trained on all actions), random-SIZE, a run directory of embed, or an .npz "
+        "table.",
+    ),
+    "representation_budget": (
+        "string",
+        None,
+        "Budget of a representation that has to be trained; default: --budget.",
+    ),
+    "split": ("string", None, "Name of the split; default: the task's first."),
+    "split_seed": ("integer", 0, "Seed of the split, where it can be drawn anew."),
+    "budget": ("string", "laptop", "smoke, laptop, paper (stage one also: fast)."),
+    "seed": ("integer", 31, "Seed of the run."),
+    "workdir": ("string", None, "Directory of the run; default: below --runs."),
+    "runs": ("string", "runs", "Where runs and what they share are kept."),
+    "overwrite": ("bool", False, "Replace an existing run instead of resuming."),
+    "workers": ("integer", 0, "Processes for environments on the host; 0: one per core."),
+    "set": (
+        "multi_string",
+        [],
+        "path.to.field=value, for any field of the config, those of the environment "
+        "(environment.FIELD) included; pool.FIELD=value says how environments on the host are run.",
+    ),
+    "observations_per_action": (
+        "integer",
+        None,
+        "Recordings per action; default: what the budget says.",
+    ),
+    "frames": (
+        "string",
+        None,
+        "Of videos: on-demand draws the frames of each batch while the batch before is learned "
+        "from, stored draws all frames once and stores them. The result is the same; default: what "
+        "the budget says.",
+    ),
+}
+_AT_LEAST = {"workers": 0, "observations_per_action": 1}
+
+
+class Arguments:
+    """The flags of one command, and how it begins and ends; `arguments.NAME` is a flag's value.
+
+    Args:
+      doc: the docstring of the command's module, shown by `--help`.
+      shared: names of flags that other commands have, too.
+    """
+
+    def __init__(self, doc: str, *shared: str) -> None:
+        self._doc = doc
+        self._values = flags.FlagValues()
+        self._names: list[str] = []
+        for name in shared:
+            kind, default, text = _SHARED[name]
+            limits = {"lower_bound": _AT_LEAST[name]} if name in _AT_LEAST else {}
+            self.define(kind, name, default, text, **limits)
+        self.define("bool", "debug_nans", False, "Stop at the operation that makes a NaN.")
+
+    def define(self, kind: str, name: str, default: Any, text: str, **options: Any) -> None:
+        """Defines a flag: `kind` is string, integer, float, bool, list, enum or multi_string."""
+        make: Any = getattr(flags, f"DEFINE_{kind}")
+        if kind == "enum":
+            make(name, default, options["choices"], text, flag_values=self._values)
+        else:
+            make(name, default, text, flag_values=self._values, **options)
+        self._names.append(name)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._values, name)
+
+    def is_given(self, name: str) -> bool:
+        """Whether a flag stands on the command line."""
+        return bool(self._values[name].present)
+
+    @property
+    def path(self) -> Path | None:
+        """`--workdir` as a path."""
+        return Path(self.workdir) if self.workdir else None
+
+    @property
+    def stores_drawn(self) -> bool | None:
+        """What `--frames` says; None if nothing.
+
+        Raises:
+          UsageError: something else than what it may say.
+        """
+        if self.frames not in (None, "on-demand", "stored"):
+            raise UsageError(f"--frames={self.frames} must be on-demand or stored.")
+        return None if self.frames is None else bool(self.frames == "stored")
+
+    def parse(self, arguments: list[str]) -> None:
+        """Reads a command line, without the program's name; flags that it lacks have defaults.
+
+        Raises:
+          UsageError: it has something that is no flag of this command, or a value is illegal.
+        """
+        for name in self._names:
+            self._values[name].unparse()
+        everything = flags.FlagValues()
+        everything.append_flag_values(self._values)
+        everything.append_flag_values(_of_absl())
+        try:
+            rest = everything(["jaxnew", *arguments])
+        except flags.Error as err:
+            raise UsageError(f"{err} (--help lists the flags.)") from err
+        if len(rest) > 1:
+            raise UsageError(f"Unknown argument {rest[1]!r}; every option is a --flag=value.")
+        self._values.mark_as_parsed()
+        flags.FLAGS.mark_as_parsed()
+
+    def help_text(self, with_absl: bool = False) -> str:
+        """What `--help` shows, and `--helpfull`."""
+        lines = [self._doc.strip(), "", "Flags:"]
+        for name in self._names:
+            flag = self._values[name]
+            default = "" if flag.default in (None, []) else f" Default: {_shown(flag.default)}."
+            text = textwrap.wrap(f"{flag.help}{default}", 94)
+            lines += [f"  --{name}", *(f"      {line}" for line in text)]
+        if with_absl:
+            lines += ["", "Flags of absl:", _of_absl().get_help("  ")]
+        return "\n".join(lines)
+
+    def start(self, main: Callable[[], None], arguments: list[str] | None = None) -> None:
+        """Runs a command's `main`; a user's mistake ends it with one line, not a traceback."""
+        arguments = sys.argv[1:] if arguments is None else arguments
+        for word, is_full in (("--helpfull", True), ("--help", False)):
+            if word in arguments:
+                print(self.help_text(is_full))
+                return
+        try:
+            self.parse(arguments)
+        except UsageError as err:
+            sys.exit(f"UsageError: {err}")
+        logging.set_verbosity(logging.WARNING)  # Orbax logs every file it writes.
+        configure_jax(self.debug_nans)
+        try:
+            main()
+        except (ValueError, ArithmeticError, WorkerError) as err:
+            if self.debug_nans or os.environ.get("JAXNEW_TRACEBACK"):
+                raise
+            sys.exit(f"{type(err).__name__}: {err}\n{_advice(err)}")
+
+
+def _of_absl() -> flags.FlagValues:
+    """The flags that absl defines by itself."""
+    own = flags.FlagValues()
+    for module, listed in flags.FLAGS.flags_by_module_dict().items():
+        if module.startswith("absl"):
+            for flag in listed:
+                own[flag.name] = flag
+    return own
+
+
+def _shown(value: Any) -> str:
+    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
+
+
+def configure_jax(debug_nans: bool = False) -> None:
+    """Compiled programs are kept between processes; `debug_nans` is obeyed."""
+    import jax
+
+    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "jaxnew"))
+    jax.config.update("jax_compilation_cache_dir", cache)
+    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
+    jax.config.update("jax_debug_nans", debug_nans)
+
+
+def _advice(err: Exception) -> str:
+    if isinstance(err, WorkerError):
+        return (
+            "The same command goes on from the last checkpoint; with "
+            "--set=pool.on_worker_death=restart it replaces workers that are lost."
+        )
+    return "(JAXNEW_TRACEBACK=1 shows where.)"

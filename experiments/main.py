@@ -1,0 +1,51 @@
+"""The command `jaxnew`: `jaxnew train ...` is `python -m experiments.train ...`, in any folder."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import sys
+from pathlib import Path
+
+import experiments
+
+COMMANDS = (
+    "collect",
+    "embed",
+    "train",
+    "evaluate",
+    "sweep",
+    "finetune",
+    "figures",
+    "analyze",
+    "anchors",
+    "contact_sheets",
+    "demo",
+)
+
+
+def main() -> None:
+    """Runs the command that the first argument names."""
+    name, *arguments = sys.argv[1:] or ["--help"]
+    if name in ("--help", "-h", "help"):
+        print(f"jaxnew COMMAND [--flag=value ...]\n\nCommands: {', '.join(COMMANDS)}.")
+        return
+    if name not in COMMANDS:
+        sys.exit(f"Unknown command {name!r}; there are {', '.join(COMMANDS)}.")
+    # Last, so that a user's modules are found and none of them stands in for one of ours.
+    sys.path.append(os.getcwd())
+    module = importlib.import_module(f"experiments.{name}")
+    sys.argv = [f"jaxnew {name}", *arguments]
+    module.ARGUMENTS.start(module.main)
+
+
+def child(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
+    """A command line and the variables of a process that runs a command of this installation."""
+    root = str(Path(experiments.__file__).parents[1])
+    path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
+    line = [sys.executable, "-P", "-m", "experiments.main", name, *arguments]
+    return line, {**os.environ, "PYTHONPATH": path}
+
+
+if __name__ == "__main__":
+    main()

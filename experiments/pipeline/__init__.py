@@ -1,1 +1,0 @@
-"""From recordings to an evaluated policy: what the commands of both stages share."""

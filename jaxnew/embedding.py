@@ -1,0 +1,430 @@
+"""Stage one: recordings of every action, an encoder that is trained on them, and its table.
+
+Made on demand, and said beforehand.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnew import collection, loop
+from jaxnew.actions import ActionSplit, ActionUniverse
+from jaxnew.observations import RecordingFormat, Recordings
+from jaxnew.representation import report
+from jaxnew.representation.learner import Modality, RepresentationLearner, RepresentationState
+from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
+from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.config import Assignments, ConfigError, from_dict
+from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
+from jaxnew.task.task import Drawing, Play, Task
+
+# One encoder is shared by all policy seeds, as in the paper; so are the recordings.
+REPRESENTATION_SEED = 31
+TABLE_FILE = "table.npz"
+SPLIT_FILE = "split.json"
+ORACLE = "-oracle"
+
+
+class Learned(NamedTuple):
+    """What the name of a learned representation says: `hvae` or `vae`, of what, and how read."""
+
+    kind: str
+    play: Play
+    modality: Modality
+
+
+def parse_representation(domain: Domain, name: str) -> Learned:
+    """What a learned representation's name, such as `hvae` or `vae-onehot`, says.
+
+    The suffix `-oracle` says that the encoder is trained on all actions, test ones included.
+
+    Raises:
+      UsageError: the name is not of that form.
+    """
+    kind, _, modality_name = name.removesuffix(ORACLE).partition("-")
+    modality_name = modality_name or next(iter(domain.play.modalities))
+    of_play = {name: play for play in domain.task.plays for name in play.modalities}
+    if kind not in ("hvae", "vae") or modality_name not in of_play:
+        legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in of_play]
+        raise UsageError(
+            f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}, each also "
+            f"with {ORACLE}; engineered: {', '.join(domain.universe.engineered)}; random-SIZE; or "
+            "an embed run, or an .npz file."
+        )
+    play = of_play[modality_name]
+    return Learned(kind, play, play.modalities[modality_name])
+
+
+@dataclass(frozen=True)
+class PlayRecordings:
+    """The recordings of every action of a domain, and how training and encoding read them.
+
+    Attributes:
+      play: how they were made.
+      recorded: what the play environment gave.
+      drawn: the same, drawn and stored; None if nothing is drawn, or on demand.
+    """
+
+    play: Play
+    recorded: Recordings
+    drawn: Recordings | None = None
+
+    def for_training(self, ids: np.ndarray) -> jax.Array | RecordingSource:
+        """The recordings of `ids`: on the device, or from a source where they are drawn."""
+        rows = self.recorded.rows(ids)
+        if self.play.drawing is None:
+            return jnp.asarray(self.recorded.data[rows])
+        return self._source(self.play.drawing, rows, self.recorded.num_recordings)
+
+    def for_encoding(
+        self, ids: np.ndarray | None = None, num_recordings: int | None = None
+    ) -> np.ndarray | RecordingSource:
+        """The first recordings of `ids`, to be read in parts; default: all of all actions."""
+        recorded = self.recorded
+        rows = np.arange(recorded.num_actions) if ids is None else recorded.rows(ids)
+        count = num_recordings or recorded.num_recordings
+        if self.play.drawing is not None:
+            return self._source(self.play.drawing, rows, count)
+        is_all = ids is None and num_recordings is None
+        return recorded.data if is_all else np.asarray(recorded.data[rows, :count])
+
+    def _source(self, drawing: Drawing, rows: np.ndarray, count: int) -> RecordingSource:
+        if self.drawn is not None:
+            return StoredRecordings(self.drawn.data[:, :count], rows)
+        data, ids = self.recorded.data[:, :count], self.recorded.ids
+        return DrawnRecordings(data, ids, drawing.draw, drawing.format.shape, rows)
+
+
+def collect(
+    domain: Domain,
+    runs: Path | str,
+    num_recordings: int,
+    play: Play | None = None,
+    stores_drawn: bool = False,
+) -> PlayRecordings:
+    """Records every action of a domain below `runs`, from where it stands, and draws if asked to.
+
+    Args:
+      num_recordings: S, per action.
+      play: which ones; default: the task's first.
+      stores_drawn: see `StageOneBudget`; of no meaning for a play without a drawing.
+
+    Raises:
+      ObservationsError: see `jaxnew.collection.collect`.
+    """
+    play, folder = play or domain.play, domain.actions_folder(Path(runs))
+    ids = np.arange(domain.universe.num_actions, dtype=np.int32)
+    drawing = play.drawing
+    if drawing is not None:
+        print(_sizes(play.format, drawing.format, len(ids), num_recordings, stores_drawn))
+    recorded = collection.collect(
+        folder / f"{play.folder}-{num_recordings}",
+        play.record_block,
+        format=play.format,
+        universe=domain.universe,
+        ids=ids,
+        num_recordings=num_recordings,
+        seed=REPRESENTATION_SEED,
+        block_actions=play.block_actions,
+    )
+    if drawing is None or not stores_drawn:
+        return PlayRecordings(play, recorded)
+    return PlayRecordings(play, recorded, _draw_all(folder, drawing, domain.universe, recorded))
+
+
+def _draw_all(
+    folder: Path, drawing: Drawing, universe: ActionUniverse, recorded: Recordings
+) -> Recordings:
+    """All recordings, drawn into a directory of their own."""
+    source = DrawnRecordings(recorded.data, recorded.ids, drawing.draw, drawing.format.shape)
+
+    def draw_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
+        return source.gather(recorded.rows(ids)[:, None], np.arange(num_recordings)[None])
+
+    return collection.collect(
+        folder / f"{drawing.folder}-{recorded.num_recordings}",
+        draw_block,
+        format=drawing.format,
+        universe=universe,
+        ids=recorded.ids,
+        num_recordings=recorded.num_recordings,
+        seed=REPRESENTATION_SEED,
+        block_actions=1,  # Of frames, 1,024 recordings are 17 MB.
+        play_settings={"drawn_from": recorded.hash},
+    )
+
+
+def _sizes(
+    small: RecordingFormat, large: RecordingFormat, num_actions: int, count: int, is_stored: bool
+) -> str:
+    """What drawing on demand and storing take."""
+    less, more = (form.estimate_bytes(num_actions, count) / 1e6 for form in (small, large))
+    now = "they are stored" if is_stored else "they are drawn on demand"
+    return (
+        f"{num_actions} actions x {count} recordings take {less:,.1f} MB where frames are drawn on "
+        f"demand (--frames=on-demand) and {less + more:,.1f} MB where they are stored "
+        f"(--frames=stored); {now}."
+    )
+
+
+@dataclass(frozen=True)
+class Encoder:
+    """A trained encoder of actions, frozen.
+
+    Attributes:
+      path: its run directory.
+      config: all that fixes it.
+      task: whose actions it was trained on.
+    """
+
+    path: Path
+    config: EmbedConfig
+    task: Task
+    _table: RepresentationTable | None = None
+
+    @classmethod
+    def load(cls, path: Path | str, task: Task | None = None) -> Encoder:
+        """The encoder of a run of `embed`.
+
+        Args:
+          path: the run directory.
+          task: in place of the one that the run names, for a task that no name or place leads to.
+
+        Raises:
+          RunDirectoryError, ConfigError: `path` is no such run.
+        """
+        directory = RunDirectory.load(path)
+        if "model" not in directory.config:
+            raise ConfigError(f"{path} is no run of an encoder: its config has no model.")
+        config = from_dict(EmbedConfig, upgraded(directory.config))
+        file = directory.path / TABLE_FILE
+        table = RepresentationTable.load(file) if file.exists() else None
+        return cls(directory.path, config, task or load_task(config.task), table)
+
+    @property
+    def is_finished(self) -> bool:
+        """Whether its training reached the end."""
+        return self._table is not None
+
+    @property
+    def table(self) -> RepresentationTable:
+        """Representations of all actions of its domain.
+
+        Raises:
+          UsageError: training was interrupted.
+        """
+        if self._table is None:
+            raise UsageError(f"{self.path} was interrupted; embed again to go on.")
+        return self._table
+
+    def domain(self) -> Domain:
+        """Its task with the split that it was trained on."""
+        return Domain.of(self.task, self.config.split, self.config.split_seed)
+
+    def encode(self, recordings: Recordings) -> RepresentationTable:
+        """Representations of recorded actions, which need not have existed before.
+
+        Args:
+          recordings: [A, S, ...] as its play environment makes them.
+
+        Raises:
+          ObservationsError: they are of another format.
+          CheckpointError: the run has no readable checkpoint.
+        """
+        learner, state, play = self.frozen()
+        fitting = recordings.fits(play.seen)
+        return RepresentationTable(
+            vectors=learner.encode(state, fitting.data),
+            ids=fitting.ids,
+            universe_hash=fitting.universe_hash,
+            split_hash=self.config.split_hash,
+            source=f"{self.config.representation} of {self.path.name}, new recordings",
+        )
+
+    def frozen(self) -> tuple[RepresentationLearner, RepresentationState, Play]:
+        """The learner, its state at the end, and the play whose recordings it reads."""
+        model = self.config.model
+        _, play, modality = parse_representation(self.domain(), self.config.representation)
+        learner = RepresentationLearner(model, modality)
+        shape = (model.actions_per_batch * 8, model.recordings_per_action, *play.seen.shape)
+        example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
+        state, _ = Checkpointer(self.path / "checkpoints").restore("latest", example)
+        return learner, state, play
+
+    def report(self) -> dict[str, Any]:
+        """Purity and linear R2 of its table, see `jaxnew.representation.report.describe`; also kept
+        in `evaluation/representation.json`.
+        """
+        domain = self.domain()
+        targets = domain.task.shown.representation_targets
+        numbers = report.describe(
+            self.table.vectors,
+            domain.universe.class_labels,
+            held_out=sorted({*domain.split.validation.tolist(), *domain.split.test.tolist()}),
+            targets=targets(domain.universe) if targets else {},
+        )
+        RunDirectory.load(self.path).record_evaluation("representation", numbers)
+        return numbers
+
+
+def embed(
+    task: Task | str,
+    representation: str = "hvae",
+    *,
+    budget: str = "laptop",
+    seed: int = REPRESENTATION_SEED,
+    split: str | None = None,
+    split_seed: int = 0,
+    set: Assignments = (),
+    num_recordings: int | None = None,
+    stores_drawn: bool | None = None,
+    workdir: Path | str | None = None,
+    runs: Path | str = "runs",
+    overwrite: bool = False,
+) -> Encoder:
+    """Trains an encoder, or resumes, or finds it complete; its table covers every action.
+
+    Args:
+      task: the domain, or what `load_task` takes.
+      representation: `hvae` or `vae` with an optional `-MODALITY` and `-oracle`, see
+        `parse_representation`.
+      budget: a preset of stage one.
+      seed: of the run, 0..2^32 - 1.
+      split, split_seed: see `Domain.of`.
+      set: fields of `EmbedConfig`, see `with_set`.
+      num_recordings, stores_drawn: instead of the budget's.
+      workdir: the run directory; default: below `runs`, named after what the run is.
+      runs: where runs and recordings are kept.
+      overwrite: replace an existing run instead of resuming.
+
+    Raises:
+      UsageError, ConfigError: something does not exist, or takes no such value.
+      ConfigMismatch: the directory holds another run.
+    """
+    task = load_task(task) if isinstance(task, str) else task
+    domain = Domain.of(task, split, split_seed)
+    kind, play, modality = parse_representation(domain, representation)
+    preset = domain.stage_one(play, budget)
+    recordings = collect(
+        domain,
+        runs,
+        num_recordings or preset.num_recordings,
+        play,
+        preset.stores_drawn if stores_drawn is None else stores_drawn,
+    )
+    train_on = "all" if representation.endswith(ORACLE) else "train"
+    config = with_set(
+        EmbedConfig(
+            task=task.actions_name or task.reference,
+            representation=representation,
+            split=domain.split_name,
+            split_seed=split_seed,
+            split_hash=domain.split.hash,
+            observations_hash=recordings.recorded.hash,
+            seed=seed,
+            train_on=train_on,
+            model=preset.config(
+                kind,
+                len(_with_always_available(domain.split, train_on)),
+                len(_with_always_available(Domain.of(task).split, "train")),
+            ),
+        ),
+        set,
+    )
+    title = f"embed-{representation}-{domain.split_label}-{budget}-{seed}"
+    path = Path(workdir) if workdir else domain.actions_folder(Path(runs)) / title
+    learner = RepresentationLearner(config.model, modality)
+    data = recordings.for_training(_with_always_available(domain.split, train_on))
+    provenance = {"split_hash": domain.split.hash}
+    with RunDirectory.open_or_create(
+        path, identity(config), overwrite, provenance, upgrade=upgraded
+    ) as run:
+        is_made = (path / TABLE_FILE).exists()
+        if not is_made:
+            print(f"Training {representation} ({config.model.num_steps} steps; {preset.cost}).")
+        result = loop.run(
+            learner.init(jax.random.key(config.seed), data.shape),
+            lambda state, n: _train_chunk(learner, data, state, n),
+            run,
+            loop.Rhythm(config.model.num_steps, preset.chunk_steps, preset.checkpoint_every),
+            loop.Display(
+                representation,
+                unit="steps",
+                work_per_step=config.model.actions_per_batch * config.model.recordings_per_action,
+                work_unit="trajectories",
+                metrics=("loss", "kl_action"),
+            ),
+        )
+        if not result.was_interrupted and not is_made:
+            domain.split.save(path / SPLIT_FILE)
+            table = RepresentationTable(
+                vectors=learner.encode(result.state, recordings.for_encoding()),
+                ids=recordings.recorded.ids,
+                universe_hash=domain.universe.hash,
+                split_hash=domain.split.hash,
+                source=f"{representation}, {budget}, seed {config.seed}",
+            )
+            table.save(path / TABLE_FILE)
+            run.add_provenance(table_hash=table.hash)
+    return Encoder.load(path, task)
+
+
+def _train_chunk(
+    learner: RepresentationLearner,
+    data: jax.Array | RecordingSource,
+    state: RepresentationState,
+    n: int,
+) -> tuple[RepresentationState, Mapping[str, Any]]:
+    state, metrics = learner.train_steps(state, data, n)
+    metrics["nonfinite/loss_and_gradient"] = metrics.pop("nonfinite")
+    return state, metrics
+
+
+def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:
+    """int32[n] the actions of a part of the split, and those that are in every set."""
+    return np.union1d(split.ids(part), split.always_available)
+
+
+def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> RepresentationTable:
+    """A table by name: engineered, `random-SIZE`, of a run of `embed`, of an `.npz`, or learned.
+
+    An encoder that is not there is trained now.
+
+    Args:
+      representation: its name, or the path of a run or file.
+      budget: of an encoder that has to be trained.
+
+    Raises:
+      UsageError: there is no such representation, or its training was interrupted.
+      SplitMismatch: the table belongs to another universe or split.
+    """
+    path = Path(representation)
+    if representation in domain.universe.engineered:
+        table = engineered_table(domain.universe, representation)
+    elif match := re.fullmatch(r"random-(\d+)", representation):
+        table = random_table(domain.universe, int(match[1]), REPRESENTATION_SEED)
+    elif path.is_dir() or path.suffix == ".npz":
+        table = RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
+    else:
+        table = embed(
+            domain.task,
+            representation,
+            budget=budget,
+            split=domain.split_name,
+            split_seed=domain.split_seed,
+            runs=runs,
+        ).table
+    table.check(domain.universe, domain.split)
+    return table

@@ -1,0 +1,311 @@
+"""A trained policy on disk: loaded, evaluated, played (paper algorithm 2)."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Self, cast
+
+import jax.numpy as jnp
+import numpy as np
+
+from jaxnew.actions import ActionSplit, mixture_ids
+from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
+from jaxnew.evaluation import EVALUATION_SEED, measure, play, summarize
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.rollout.contract import Episode, Policy
+from jaxnew.sampling import Actions
+from jaxnew.storage.checkpoint import KINDS, Checkpointer, Kind
+from jaxnew.storage.config import Assignments
+from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import (
+    TrainConfig,
+    check_seed,
+    only_computed,
+    read_train_config,
+)
+from jaxnew.task.task import Task
+from jaxnew.trainer import Trainer
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """Numbers of one checkpoint, by list of actions; prints as a table.
+
+    Attributes:
+      title: which checkpoint of which run.
+      rows: by name of the actions what `to_dict` returns.
+    """
+
+    title: str
+    rows: Mapping[str, Mapping[str, Any]]
+
+    def to_dict(self) -> dict[str, dict[str, Any]]:
+        """By name of the actions: `metrics`, each with `mean`, `low`, `high` and the kind of
+        `interval` over episodes; `num_episodes`, `num_actions`, `set_size`, `policy`,
+        `evaluation_seed` and `seconds`.
+        """
+        return {name: dict(row) for name, row in self.rows.items()}
+
+    def __str__(self) -> str:
+        lines = [f"{self.title}; mean [95 % interval over episodes]"]
+        for name, row in self.rows.items():
+            metrics = "  ".join(
+                f"{metric} {value['mean']:.4f} [{value['low']:.4f}, {value['high']:.4f}]"
+                for metric, value in row["metrics"].items()
+            )
+            lines.append(f"{name:>12} ({row['num_episodes']} episodes, {row['policy']}): {metrics}")
+        return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Run:
+    """A policy from a run directory. Nothing but the directory is needed to load one.
+
+    A context manager: on the host it holds worker processes once it has played.
+
+    Attributes:
+      path: the run directory.
+      trainer: the parts of the run.
+      policy: parameters and statistics of the checkpoint.
+      step: updates that it was trained for.
+      checkpoint: kind of the checkpoint, `best` (by validation) or `latest`.
+      was_interrupted: training was stopped before its end; train again to go on.
+    """
+
+    path: Path
+    trainer: Trainer
+    policy: Policy
+    step: int
+    checkpoint: str
+    was_interrupted: bool = False
+
+    @classmethod
+    def load(
+        cls,
+        path: Path | str,
+        checkpoint: Kind | None = None,
+        *,
+        task: Task | None = None,
+        num_workers: int = 0,
+        set: Assignments = (),
+    ) -> Run:
+        """The policy of a run of `train`, `finetune` or a member of `sweep`.
+
+        Args:
+          path: the run directory, or one of its checkpoints.
+          checkpoint: `best` or `latest`; None for what `path` names, else `best`.
+          task: in place of the one that the run names, for a task that no name or place leads to.
+          num_workers: processes for environments on the host; 0: one per core.
+          set: `pool.FIELD` alone, how environments on the host are run.
+
+        Raises:
+          UsageError: `path` is neither a run nor in one.
+          RunDirectoryError, ConfigError: it is no run of a policy.
+          SplitMismatch: split or table were changed since.
+          CheckpointError: there is no such checkpoint.
+        """
+        path, named = locate(Path(path))
+        directory = RunDirectory.load(path)
+        trainer = load_trainer(directory, num_workers, set, task)
+        return cls.of(directory.path, trainer, checkpoint or named or "best")
+
+    @classmethod
+    def of(cls, path: Path, trainer: Trainer, checkpoint: Kind) -> Run:
+        """A checkpoint of a run whose parts are there."""
+        example = trainer.learner.policy_shapes(trainer.training)
+        checkpointer = Checkpointer(path / "checkpoints")
+        state, _ = checkpointer.restore(checkpoint, example, is_part=True)
+        return cls(path, trainer, state.policy, int(state.step), checkpoint)
+
+    @property
+    def config(self) -> TrainConfig:
+        """All that fixes the run."""
+        return self.trainer.config
+
+    @property
+    def task(self) -> Task:
+        """What it was trained on."""
+        return self.trainer.task
+
+    @property
+    def split(self) -> ActionSplit:
+        """What it was trained and selected with."""
+        return self.trainer.split
+
+    def evaluate(
+        self,
+        parts: str | Sequence[str] = (),
+        *,
+        ids: Mapping[str, np.ndarray] | None = None,
+        table: RepresentationTable | None = None,
+        table_name: str = "",
+        unseen_ratio: float | None = None,
+        episodes: int = 5000,
+        set_size: int | None = None,
+        grows_from: int = 0,
+        growth: int = 1,
+        greedy: bool = False,
+        seed: int = EVALUATION_SEED,
+        record: bool = True,
+    ) -> Evaluation:
+        """Plays episodes on action sets, with no further training.
+
+        Args:
+          parts: of the split, one or several of `train`, `validation`, `test`, `all`; default:
+            `test`, where nothing else says what to draw from.
+          ids: by name, int32[n] actions to draw sets from.
+          table: representations of actions, which are drawn from, in place of the run's own.
+          table_name: what its results are called; default: the beginning of its hash.
+          unseen_ratio: draw from a mixture of train and test actions with such a share of the
+            latter.
+          episodes: per list of actions.
+          set_size: actions per set; None for as many as in training.
+          grows_from, growth: of a set that grows during the episode, see `Actions.first_size`.
+          greedy: take the most likely action instead of sampling.
+          seed: of the episodes.
+          record: keep the results in the run directory, `evaluation/*.json`.
+
+        Raises:
+          UsageError: several of `parts`, `ids`, `table`, `unseen_ratio` are given, or the table has
+            another width or actions that the environment does not have.
+          ValueError: there are no such sets.
+        """
+        check_seed(seed, "seed of the evaluation")
+        own = self.trainer.training.table
+        vectors = own if table is None else with_rows(own, table)
+        if table is not None:
+            table_name = f"table-{table_name or table.hash[:8]}"
+        of_table = None if table is None else {table_name: table.ids}
+        named = (parts,) if isinstance(parts, str) else tuple(parts)
+        lists = self._lists(named, ids, of_table, unseen_ratio)
+        rows: dict[str, dict[str, Any]] = {}
+        for name, chosen in lists.items():
+            actions = self.trainer.actions(name, chosen, set_size, vectors)
+            rows[name] = self._row(actions.growing(grows_from, growth), episodes, seed, greedy)
+            if record:
+                self.record(name, rows[name])
+        return Evaluation(f"{self.path}, {self.checkpoint} checkpoint (update {self.step})", rows)
+
+    def _row(self, actions: Actions, episodes: int, seed: int, greedy: bool) -> dict[str, Any]:
+        start = time.perf_counter()
+        played = measure(self.trainer.rollout, self.policy, actions, episodes, seed, greedy)
+        growth = {"first_size": actions.first_size, "growth": actions.growth}
+        return {
+            "metrics": summarize(played),
+            "num_episodes": episodes,
+            "num_actions": int(actions.pool.size),
+            "set_size": actions.set_size,
+            **(growth if actions.first_size else {}),
+            "policy": "greedy" if greedy else "sampled",
+            "evaluation_seed": seed,
+            "seconds": round(time.perf_counter() - start, 2),
+        }
+
+    def _lists(
+        self,
+        parts: tuple[str, ...],
+        ids: Mapping[str, np.ndarray] | None,
+        of_table: Mapping[str, np.ndarray] | None,
+        unseen_ratio: float | None,
+    ) -> dict[str, np.ndarray | None]:
+        """By name, the actions to draw from; None for a part of the split."""
+        given = [bool(parts), ids is not None, of_table is not None, unseen_ratio is not None]
+        if sum(given) > 1:
+            raise UsageError(
+                "Give one of parts of the split, ids, table, unseen_ratio; each of them says where "
+                "sets come from."
+            )
+        if ids is not None or of_table is not None:
+            return dict(ids or of_table or {})
+        if unseen_ratio is not None:
+            mixed = mixture_ids(self.split.train, self.split.test, unseen_ratio)
+            return {f"unseen-{unseen_ratio:g}": mixed}
+        return dict.fromkeys(parts or ("test",))
+
+    def record(self, name: str, row: Mapping[str, Any]) -> Path:
+        """Keeps one result in the run directory; returns its file."""
+        content = {"checkpoint": self.checkpoint, "step": self.step, "actions": name, **row}
+        return RunDirectory.load(self.path).record_evaluation(file_stem(content), content)
+
+    def play(
+        self, part: str = "test", first: int = 0, count: int = 1, seed: int = EVALUATION_SEED
+    ) -> list[Episode]:
+        """Episodes `first..first+count-1` of `evaluate`, with all that happened in them.
+
+        Args:
+          part: of the split, that available sets are drawn from.
+          first, count: numbers of the episodes.
+          seed: of the evaluation.
+        """
+        actions = self.trainer.actions(part)
+        return play(self.trainer.rollout, self.policy, actions, first, count, seed)
+
+    def acting_as(self, policy: Policy, name: str) -> Run:
+        """The same run with other parameters, recorded under another name."""
+        return replace(self, policy=policy, checkpoint=name)
+
+    def close(self) -> None:
+        """Ends the processes of environments on the host."""
+        self.trainer.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self.close()
+
+
+def locate(path: Path) -> tuple[Path, Kind | None]:
+    """The run directory that `path` is or lies in, and the kind of checkpoint that it names.
+
+    Raises:
+      UsageError: it is neither.
+    """
+    for folder in (path, *path.parents):
+        if (folder / "config.json").is_file():
+            inside = path.relative_to(folder).parts
+            is_named = len(inside) > 1 and inside[0] == "checkpoints" and inside[1] in KINDS
+            return folder, cast(Kind, inside[1]) if is_named else None
+    raise UsageError(f"{path} is neither a run directory nor in one (no config.json).")
+
+
+def load_trainer(
+    directory: RunDirectory,
+    num_workers: int = 0,
+    assignments: Assignments = (),
+    task: Task | None = None,
+) -> Trainer:
+    """The parts of a run, from its directory alone; see `Run.load`."""
+    config, task = read_train_config(directory.config, task)
+    config = only_computed(config, assignments)
+    split = ActionSplit.load(directory.path / SPLIT_FILE)
+    table = RepresentationTable.load(directory.path / TABLE_FILE)
+    split.check(task.make_universe())
+    table.check(task.make_universe(), split)
+    return Trainer.of(config, task, split, table, num_workers)
+
+
+def with_rows(vectors: Any, new: RepresentationTable) -> Any:
+    """f32[A, d] representations with the rows of `new` in place of their own.
+
+    Raises:
+      UsageError: the new rows have another width, or ids that the environment does not have.
+    """
+    if new.vectors.shape[1] != vectors.shape[1] or new.ids.max() >= vectors.shape[0]:
+        raise UsageError(
+            f"The new table has {new.vectors.shape[1]} numbers per action and ids up to "
+            f"{new.ids.max()}; the policy reads {vectors.shape[1]} numbers, and the environment "
+            f"has ids 0..{vectors.shape[0] - 1}."
+        )
+    return vectors.at[jnp.asarray(new.ids)].set(jnp.asarray(new.vectors))
+
+
+def file_stem(content: Mapping[str, Any]) -> str:
+    """What a result is called: results that were made differently have files of their own."""
+    grown = f"-from{content['first_size']}-by{content['growth']}" if "first_size" in content else ""
+    stem = "{actions}-{checkpoint}-{policy}-m{set_size}".format(**content)
+    return f"{stem}{grown}"

@@ -1,0 +1,408 @@
+"""Many seeds and hyper-parameters as one program, sharded over all devices.
+
+Every member ends as an ordinary run directory, as `train` would have made it.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+
+from jaxnew import loop
+from jaxnew.evaluation import EVALUATION_SEED
+from jaxnew.ppo import Hyperparameters, TrainState
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.run import Run
+from jaxnew.sampling import Actions
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.config import Assignments, plain
+from jaxnew.storage.metrics import MetricsLog, read
+from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.methods import file_name, variant_of
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import TrainConfig, identity, upgraded, with_set
+from jaxnew.task.task import Task
+from jaxnew.trainer import Trainer
+from jaxnew.training import named_table, open_run, train_config
+
+
+@struct.dataclass
+class SweepState:
+    """The members of a sweep; every leaf has a leading axis of M members.
+
+    Attributes:
+      members: training states.
+      best: the state of each member at its best validation so far.
+      best_metric: f32[M] that validation value, -inf before the first.
+    """
+
+    members: TrainState
+    best: TrainState
+    best_metric: jax.Array
+
+    @property
+    def step(self) -> int:
+        """Updates done; the same for all members."""
+        return int(self.members.step[0])
+
+
+@dataclass(frozen=True)
+class SweepProgram:
+    """M runs that differ in seed and hyper-parameters only.
+
+    Attributes:
+      trainer: the compiled parts, which all share.
+      configs: of the members.
+      devices: their number divides that of the members.
+      members_at_once: members that a device vmaps; it takes the others after them.
+    """
+
+    trainer: Trainer
+    configs: tuple[TrainConfig, ...]
+    devices: tuple[jax.Device, ...]
+    members_at_once: int
+
+    @classmethod
+    def of(
+        cls,
+        trainer: Trainer,
+        configs: Sequence[TrainConfig],
+        devices: Sequence[jax.Device],
+        members_at_once: int = 0,
+    ) -> SweepProgram:
+        """A sweep on the largest number of `devices` that divides the number of members.
+
+        `members_at_once=0` means all that a device has, but 1 on CPUs, which are faster so: what
+        one member needs stays in the caches (`experiments/benchmarks/sweep.py`).
+        """
+        count = max(n for n in range(1, len(devices) + 1) if len(configs) % n == 0)
+        share = len(configs) // count
+        default = 1 if devices[0].platform == "cpu" else share
+        at_once = min(members_at_once or default, share)
+        return cls(trainer, tuple(configs), tuple(devices[:count]), at_once)
+
+    @cached_property
+    def sharding(self) -> jax.sharding.NamedSharding:
+        """Members are split over the devices."""
+        mesh = jax.sharding.Mesh(np.array(self.devices), ("members",))
+        return jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("members"))
+
+    def _for_members(self, function: Any) -> Any:
+        """`function` of one member, for all: mapped within a device, split over the devices.
+
+        No device waits for another, as they would if the compiler split the mapped program.
+        """
+
+        def on_a_device(*members: Any) -> Any:
+            if self.members_at_once == len(self.configs) // len(self.devices):
+                return jax.vmap(function)(*members)
+            batch_size = self.members_at_once if self.members_at_once > 1 else None
+            return jax.lax.map(lambda member: function(*member), members, batch_size=batch_size)
+
+        return jax.shard_map(
+            on_a_device,
+            mesh=self.sharding.mesh,
+            in_specs=self.sharding.spec,
+            out_specs=self.sharding.spec,
+            check_vma=False,  # Initial carries of the scans inside are the same on every device.
+        )
+
+    @cached_property
+    def hyperparameters(self) -> Hyperparameters:
+        """Numbers of all members, f32[M] each."""
+        stacked = jax.tree.map(
+            lambda *values: jnp.array(values, jnp.float32),
+            *(config.hyperparameters for config in self.configs),
+        )
+        return jax.device_put(stacked, self.sharding)
+
+    def init(self) -> SweepState:
+        """Every member before its first update."""
+        keys = jnp.stack([jax.random.key(config.seed) for config in self.configs])
+        actions = self.trainer.training
+        # One after the other: the batched QR of orthogonal initialisers never returns on CPUs
+        # (jaxlib 0.10.2).
+        init = jax.jit(
+            lambda keys: jax.lax.map(lambda key: self.trainer.learner.init(key, actions), keys)
+        )
+        members = jax.device_put(init(keys), self.sharding)
+        worst = jnp.full(len(self.configs), -jnp.inf)
+        return SweepState(members, members, jax.device_put(worst, self.sharding))
+
+    @cached_property
+    def _updates(self) -> Any:
+        def run(members: TrainState, hyperparameters: Hyperparameters, n: int) -> Any:
+            actions = self.trainer.training
+            update = self._for_members(
+                lambda state, numbers: self.trainer.learner.updates(state, numbers, actions, n)
+            )
+            return update(members, hyperparameters)
+
+        return jax.jit(run, static_argnames="n")
+
+    @cached_property
+    def _evaluation(self) -> Any:
+        """Mean episode metrics per member, {split/metric: f32[M]}."""
+        episodes = self.trainer.config.loop.evaluation_episodes
+        key = jax.random.key(EVALUATION_SEED)
+
+        rollout = self.trainer.rollout
+        assert isinstance(rollout, DeviceRollout)
+
+        def of_member(state: TrainState) -> dict[str, jax.Array]:
+            results: dict[str, jax.Array] = {}
+            for part, actions in self.trainer.watched.items():
+
+                def block(start: jax.Array, actions: Actions = actions) -> dict[str, jax.Array]:
+                    return rollout.play(state.policy, actions, key, start)[0]
+
+                blocks = jax.lax.map(block, jnp.arange(0, episodes, rollout.width))
+                results |= {
+                    f"{part}/{metric}": jnp.mean(values.reshape(-1)[:episodes])
+                    for metric, values in blocks.items()
+                }
+            return results
+
+        return jax.jit(self._for_members(of_member))
+
+    @cached_property
+    def _keep_best(self) -> Any:
+        def keep(state: SweepState, metric: jax.Array) -> SweepState:
+            is_better = metric > state.best_metric
+
+            def pick(new: jax.Array, old: jax.Array) -> jax.Array:
+                return jnp.where(is_better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+            best = jax.tree.map(pick, state.members, state.best)
+            return SweepState(state.members, best, jnp.maximum(metric, state.best_metric))
+
+        return jax.jit(keep)
+
+    def chunk(self, state: SweepState, num_updates: int) -> tuple[SweepState, dict[str, float]]:
+        """Updates, and an evaluation where one is due; metrics are named `MEMBER/metric`."""
+        members, metrics = self._updates(state.members, self.hyperparameters, n=num_updates)
+        state = replace(state, members=members)
+        config = self.trainer.config
+        is_last = state.step == config.num_updates
+        if is_last or state.step % config.loop.evaluate_every == 0:
+            results = self._evaluation(members)
+            state = self._keep_best(state, results[self.trainer.selection_metric])
+            metrics = {**metrics, **results}
+        values = {name: np.asarray(value) for name, value in metrics.items()}
+        return state, {
+            f"{member:03d}/{name}": float(value[member])
+            for name, value in values.items()
+            for member in range(len(self.configs))
+        }
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The runs of a sweep, one per seed and combination of what was varied.
+
+    Attributes:
+      path: directory of the sweep.
+      rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
+        hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
+      selection_metric: what `best_metric` is.
+    """
+
+    path: Path
+    rows: tuple[Mapping[str, Any], ...]
+    selection_metric: str
+
+    def table(self) -> list[dict[str, Any]]:
+        """Rows for `pandas.DataFrame`."""
+        return [dict(row) for row in self.rows]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Run]:
+        """Loads one run after the other."""
+        return (Run.load(row["path"]) for row in self.rows)
+
+    def best(self) -> Run:
+        """The run with the highest validation.
+
+        Raises:
+          UsageError: the sweep was interrupted, or nothing was evaluated.
+        """
+        rated = [row for row in self.rows if row["best_metric"] is not None]
+        if not rated:
+            raise UsageError(f"{self.path} has no evaluated runs; sweep again to go on.")
+        return Run.load(max(rated, key=lambda row: row["best_metric"])["path"])
+
+
+def sweep(
+    task: Task | str,
+    table: RepresentationTable | str | Path,
+    *,
+    seeds: Iterable[int],
+    vary: Mapping[str, Sequence[float]] | None = None,
+    method: str = "ours",
+    budget: str = "laptop",
+    split: str | None = None,
+    split_seed: int = 0,
+    set: Assignments = (),
+    representation_budget: str | None = None,
+    workdir: Path | str | None = None,
+    runs: Path | str = "runs",
+    overwrite: bool = False,
+    members_at_once: int = 0,
+) -> Runs:
+    """Trains every seed with every combination of hyper-parameters, as one program.
+
+    Args:
+      task, table, method, budget, split, split_seed, set, representation_budget, runs, overwrite:
+        as of `train`.
+      seeds: of the members, each once.
+      vary: values by field of `Hyperparameters`.
+      workdir: directory of the sweep, whose `members/` are the runs; default: below `runs`.
+      members_at_once: members that a device vmaps; 0: all, or 1 on CPUs.
+
+    Raises:
+      UsageError: the environments run on the host, or as of `train`.
+    """
+    task = load_task(task) if isinstance(task, str) else task
+    if task.host is not None:
+        raise UsageError(
+            f"The environments of {task.name} run on the host, so its runs cannot be one program. "
+            "Run `train` once per seed, with set=hyperparameters.NAME=VALUE for what is to vary."
+        )
+    domain, runs = Domain.of(task, split, split_seed), Path(runs)
+    variant_of(method)  # Before a representation is trained for it.
+    listed = checked_seeds(seeds)
+    name, found = named_table(domain, runs, table, representation_budget or budget)
+    preset = task.budget(budget)
+    base = with_set(train_config(domain, method, name, found, preset, listed[0]), set)
+    configs = member_configs(base, listed, vary or {})
+    trainer = Trainer.of(configs[0], task, domain.split, found)
+    program = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
+    words = ["sweep", file_name(method), Path(name).stem]
+    words += [domain.split_label] * (domain.split_label != task.default_split)
+    path = Path(workdir or domain.folder(runs) / "-".join(words))
+    members = {"members": [identity(config) for config in configs]}
+    with RunDirectory.open_or_create(path, members, overwrite, upgrade=upgraded) as directory:
+        print(
+            f"{len(configs)} members on {len(program.devices)} device(s), {base.num_updates} "
+            f"updates each ({len(configs)} x {preset.cost}, less what they share) in {path}."
+        )
+        result = loop.run(
+            program.init(),
+            program.chunk,
+            directory,
+            loop.Rhythm(base.num_updates, base.loop.evaluate_every, base.loop.checkpoint_every),
+            loop.Display(
+                f"sweep of {len(configs)}",
+                work_per_step=base.ppo.steps_per_update * len(configs),
+            ),
+            may_be_nan=("*",),  # One diverged member does not end the others.
+        )
+        rows = () if result.was_interrupted else write_members(directory, program, result.state)
+    return Runs(path, rows, trainer.selection_metric)
+
+
+def checked_seeds(seeds: Iterable[int]) -> list[int]:
+    """Distinct seeds, at least one.
+
+    Raises:
+      UsageError: there is none, or one stands there twice.
+    """
+    listed = list(seeds)
+    if not listed or len(dict.fromkeys(listed)) != len(listed):
+        raise UsageError(f"A sweep needs distinct seeds and at least one, got {listed}.")
+    return listed
+
+
+def member_configs(
+    base: TrainConfig, seeds: Sequence[int], vary: Mapping[str, Sequence[float]]
+) -> list[TrainConfig]:
+    """One config per seed and combination of the varied hyper-parameters.
+
+    Raises:
+      UsageError: there is no such hyper-parameter, or no value for it.
+      ValueError: a value is out of its range.
+    """
+    legal = [field.name for field in fields(Hyperparameters)]
+    for name, values in vary.items():
+        if name not in legal or not len(values):
+            raise UsageError(
+                f"Cannot vary {name} over {list(values)}: give at least one value for a "
+                f"hyper-parameter of {', '.join(legal)}."
+            )
+    combinations = itertools.product(*vary.values())
+    return [
+        replace(
+            base,
+            seed=seed,
+            hyperparameters=replace(
+                base.hyperparameters,
+                **dict(zip(vary, map(float, combination), strict=True)),
+            ),
+        )
+        for combination in combinations
+        for seed in seeds
+    ]
+
+
+def write_members(
+    directory: RunDirectory, program: SweepProgram, state: SweepState
+) -> tuple[dict[str, Any], ...]:
+    """Writes one run directory per member; returns a row for each, see `Runs`.
+
+    All appear at once, when all are whole; members that are there are left alone.
+    """
+    lines = read(directory.path / "metrics.jsonl")
+    partial, members = directory.path / "members.partial", directory.path / "members"
+    rows = []
+    for index, config in enumerate(program.configs):
+        path = members / f"{index:03d}"
+        best, latest = (
+            jax.tree.map(lambda x, i=index: x[i], tree) for tree in (state.best, state.members)
+        )
+        best_metric = float(state.best_metric[index])
+        has_best = bool(np.isfinite(best_metric))
+        metadata = {
+            "best_metric": best_metric if has_best else None,
+            "best_step": int(best.step) if has_best else None,
+            "elapsed_s": lines[-1].get("time/elapsed_s", 0.0),
+        }
+        if not members.exists():
+            trainer = replace(program.trainer, config=config)
+            with open_run(partial / path.name, trainer, overwrite=True) as member:
+                write_metrics(member, lines, f"{index:03d}/")
+                checkpointer = Checkpointer(member.checkpoints)
+                if has_best:
+                    checkpointer.save("best", int(best.step), best, metadata)
+                checkpointer.save("latest", config.num_updates, latest, metadata)
+        numbers = plain(config.hyperparameters)
+        rows.append({"path": str(path), "seed": config.seed, **metadata, **numbers})
+    if not members.exists():
+        partial.rename(members)
+    directory.record_evaluation("members", {"members": rows})
+    return tuple(rows)
+
+
+def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str) -> None:
+    """The lines of one member, under the names that `train` gives them."""
+    with MetricsLog(member.path) as log:
+        for line in lines:
+            values = {
+                name.removeprefix(prefix): value
+                for name, value in line.items()
+                if name.startswith(prefix) and value is not None
+            }
+            if values:
+                log.write(line["step"], values)

@@ -1,0 +1,153 @@
+"""How a domain is shown: films, studies, anchors, and where it stands in the paper's results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+
+from jaxnew.actions import ActionUniverse
+from jaxnew.environment import Action
+
+
+@dataclass(frozen=True)
+class ActionStudy:
+    """Pools of actions that a trained policy is evaluated on, from easy to hard.
+
+    Attributes:
+      axis: what `values` are.
+      values: the paper's.
+      ids: `(table f32[A, d], value) -> int32[n]` actions that sets are drawn from.
+      note: the rule, for readers of the table.
+      paper_method: `value ->` name of the row in the paper's results, or None if it has none.
+      figure: number of the paper's figure, or empty.
+    """
+
+    axis: str
+    values: tuple[float, ...]
+    ids: Callable[[np.ndarray, float], np.ndarray]
+    note: str
+    paper_method: Callable[[float], str] | None = None
+    figure: str = ""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """Speeds on one core of the machine that `README.md` names; for foretelling durations.
+
+    Attributes:
+      training: environment steps per second by method; one that is absent is taken as `ours`.
+      evaluation: episodes per second.
+    """
+
+    training: Mapping[str, float]
+    evaluation: float
+
+
+class Film(NamedTuple):
+    """An episode to look at.
+
+    Attributes:
+      frames: uint8[height, width, 3] each, all of one size; the last one shows the end.
+      metrics: of the pool's `episode_metrics`, at the end.
+    """
+
+    frames: list[np.ndarray]
+    metrics: Mapping[str, float]
+
+
+class MakeFilm(Protocol):
+    """Plays an episode of a pool again, from its seed and the T actions that it was told.
+
+    Args:
+      seed: of the episode, see `jaxnew.rollout.pool.HostPool`.
+      ids, positions: int32[T] and f32[T, k].
+      size: pixels of the frames' height.
+    """
+
+    def __call__(
+        self, seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, *, size: int
+    ) -> Film: ...
+
+
+class DrawEpisode(Protocol):
+    """Draws an episode of an environment inside jit.
+
+    Args:
+      env: where it was played.
+      states: T + 1 states, the start and what `step_env` returned after each action.
+      actions: T actions.
+      rewards: T rewards.
+      size: pixels of the frames' height, about.
+
+    Returns:
+      Frames uint8[height, width, 3], all of one size; the last one shows the end.
+    """
+
+    def __call__(
+        self,
+        env: Any,
+        states: Sequence[Any],
+        actions: Sequence[Action],
+        rewards: Sequence[float],
+        *,
+        size: int,
+    ) -> list[np.ndarray]: ...
+
+
+class MakePage(Protocol):
+    """An episode of an environment inside jit as an interactive page.
+
+    Args:
+      env, states, actions: as of `DrawEpisode`.
+
+    Returns:
+      HTML.
+    """
+
+    def __call__(self, env: Any, states: Sequence[Any], actions: Sequence[Action]) -> str: ...
+
+
+@dataclass(frozen=True)
+class Filming:
+    """How episodes of an environment inside jit are shown.
+
+    Attributes:
+      draw: see `DrawEpisode`.
+      make_page: see `MakePage`; None where there is none.
+      success_from: an episode whose `Task.selection_metric` is at least this is a success.
+      criterion: the same in words, where the metric is not success itself. The sheet of an
+        evaluation's last pictures then shows the best and the worst of them.
+    """
+
+    draw: DrawEpisode
+    success_from: float = 1.0
+    criterion: str = ""
+    make_page: MakePage | None = None
+
+
+@dataclass(frozen=True)
+class Presentation:
+    """What reports need of a domain. Nothing that is trained or evaluated depends on it.
+
+    Attributes:
+      paper_environment: name of the domain in the paper's results, or None.
+      paper_variant: what the paper's results append to the names of methods for this variant of the
+        domain, such as `no_subgoal_reward`; empty for the domain itself.
+      measured: speeds, or None where nobody measured them.
+      representation_targets: `universe -> {name: f[A, k]}`, what a linear map of a good
+        representation should explain.
+      studies: what `analyze` offers for this task beside what it offers for every one.
+      filming: how episodes are shown, or None where they cannot be drawn.
+      anchors: `package.module:NAME` of what `anchors` plays without training; None: nothing.
+    """
+
+    paper_environment: str | None = None
+    paper_variant: str = ""
+    measured: Measured | None = None
+    representation_targets: Callable[[ActionUniverse], Mapping[str, np.ndarray]] | None = None
+    studies: Mapping[str, ActionStudy] = field(default_factory=dict)
+    filming: Filming | None = None
+    anchors: str | None = None
