@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from envs_host._log import ActionLog
+from envs_host.episodes import ActionLog
 from envs_host.pool import HostPool, ReplayMismatch, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, NAME
 from tests.envs_host.test_pool_faults import numbers
