@@ -1,4 +1,4 @@
-"""What a process pool asks of an environment, how it is run, Gymnasium environments in that form."""
+"""What a process pool asks of an environment, how it runs, Gymnasium environments in that form."""
 
 from __future__ import annotations
 

@@ -3,11 +3,10 @@
 Importing it registers the Gymnasium ids of `registration`.
 """
 
-from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.config import CreateConfig, PhysicsConfig, RewardConfig
 from envs_host.create.environment import CreateEnv
 from envs_host.create.levels import load_level, register_folder, register_level
 from envs_host.create.registration import register_environments
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.tools import tool_universe
 from envs_host.create.world import drop_test
 

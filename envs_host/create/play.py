@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from envs_host.create.building import build_tool
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.geometry import DIAGONAL, Point, to_normalised, to_units
 from envs_host.create.sprites import Sprite
-from envs_host.create.stage import PhysicsConfig, Stage
+from envs_host.create.stage import Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import Tool, ToolClass, all_tools
 from envs_host.create.tools.catalogue import DEFAULT_SPACING_DEG

@@ -15,11 +15,12 @@ import pymunk
 
 from envs_host.create import things
 from envs_host.create.building import build_object, build_tool
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.geometry import Point, to_units
 from envs_host.create.layout import Layout
 from envs_host.create.levels.schema import MARKER_TYPE, BallSpec, GoalSpec
 from envs_host.create.sprites import Kind, Sprite, Tone
-from envs_host.create.stage import PhysicsConfig, Stage
+from envs_host.create.stage import Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import Tool, ToolClass, all_tools
 

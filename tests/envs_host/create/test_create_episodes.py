@@ -11,13 +11,12 @@ import pytest
 import yaml
 
 from envs_host.create import things
-from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.config import CreateConfig, PhysicsConfig, RewardConfig
 from envs_host.create.episode import End, Episode, Outcome
 from envs_host.create.geometry import scaled_distance
 from envs_host.create.layout import Layout
 from envs_host.create.levels import TASK_NAMES, load_level, parse_level
 from envs_host.create.sprites import Kind, Tone
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.tools import all_tools, no_op_id
 from envs_host.create.world import Placement
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from envs_host.create.building import build_object
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.layout import Layout, draw_layout
 from envs_host.create.levels import (
     TASK_NAMES,
@@ -22,7 +23,6 @@ from envs_host.create.levels import (
     register_level,
 )
 from envs_host.create.levels.object_types import ALL_TYPES, BASIC_TYPES
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.world import World
 
 SMALL = {

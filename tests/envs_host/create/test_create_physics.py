@@ -17,8 +17,9 @@ import yaml
 
 from envs_host.create import things
 from envs_host.create.building import build_tool
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.sprites import Kind, Sprite, Tone
-from envs_host.create.stage import PhysicsConfig, Stage
+from envs_host.create.stage import Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import ToolClass, all_tools
 from envs_host.create.world import drop_test, probe_ball
@@ -440,7 +441,12 @@ def test_moving_sprites_follow_their_bodies() -> None:
 
 @pytest.mark.unit
 @pytest.mark.parametrize(
-    ("wrong", "message"), [({"substeps": 0}, "substeps"), ({"fan_frame": "ball"}, "fan_frame")]
+    ("wrong", "message"),
+    [
+        ({"substeps": 0}, "substeps"),
+        ({"fan_frame": "ball"}, "fan_frame"),
+        ({"gravity": -2.0}, "gravity=-2.0 must be at least 0"),
+    ],
 )
 def test_wrong_physics_is_refused(wrong: dict, message: str) -> None:
     with pytest.raises(ValueError, match=message):
