@@ -15,7 +15,7 @@ from typing import Any
 
 import pymunk
 
-Point = tuple[float, float]
+from envs_host.create.geometry import Point
 
 
 class Contact(IntEnum):

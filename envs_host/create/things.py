@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import pymunk
 
+from envs_host.create.geometry import Point
 from envs_host.create.handlers import (
     BucketLaw,
     CannonLaw,
@@ -20,7 +21,6 @@ from envs_host.create.handlers import (
     FunnelLaw,
     Law,
     PlankLaw,
-    Point,
 )
 from envs_host.create.sprites import Kind, Sprite, Tone
 
