@@ -1,4 +1,4 @@
-"""CREATE: physics puzzles solved by placing tools (spec create). NumPy and pymunk, no jax.
+"""CREATE: physics puzzles solved by placing tools (docs/create.md). NumPy and pymunk, no jax.
 
 Importing it registers the Gymnasium ids of `registration`.
 """

@@ -1,4 +1,4 @@
-"""From tools and from the objects of a level to things in the world (spec create 2.1, 5.3)."""
+"""From tools and from the objects of a level to things in the world."""
 
 from __future__ import annotations
 

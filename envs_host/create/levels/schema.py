@@ -1,4 +1,4 @@
-"""What a level file holds, read and checked (spec create 5.0). Numbers only, no expressions.
+"""What a level file holds, read and checked. Numbers only, no expressions.
 
 A file is one JSON object:
 

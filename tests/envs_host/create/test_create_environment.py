@@ -1,4 +1,4 @@
-"""CREATE through Gymnasium: spaces, action sets, seeds, info, settings (spec create 8 and 10)."""
+"""CREATE through Gymnasium: spaces, action sets, seeds, info, settings."""
 
 from __future__ import annotations
 
