@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from envs_host.create import things
-from envs_host.create.handlers import Point
+from envs_host.create.geometry import Point
 from envs_host.create.sprites import Tone
 from envs_host.create.things import Thing
 from envs_host.create.tools.catalogue import POLYGON_SIDES, Tool, ToolClass

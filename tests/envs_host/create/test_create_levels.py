@@ -51,7 +51,7 @@ def read(**changes: object) -> object:
 
 
 @pytest.mark.golden
-def test_built_in_levels_are_those_of_the_spec() -> None:
+def test_built_in_levels_have_their_figures() -> None:
     assert set(TASK_NAMES) | {"GoalTest"} <= set(level_names())
     markers = {name for name in TASK_NAMES if load_level(name).has_marker}
     assert markers == {"Push", "Navigate", "Ladder", "Cannon", "Obstacle"}

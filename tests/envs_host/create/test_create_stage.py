@@ -437,17 +437,3 @@ def test_moving_sprites_follow_their_bodies() -> None:
     drawn = next(ball.sprites())
     assert (drawn.x, drawn.y) == tuple(ball.body.position) != (47.0, 50.0)
     assert next(plank.sprites()).angle == plank.body.angle != 0.0
-
-
-@pytest.mark.unit
-@pytest.mark.parametrize(
-    ("wrong", "message"),
-    [
-        ({"substeps": 0}, "substeps"),
-        ({"fan_frame": "ball"}, "fan_frame"),
-        ({"gravity": -2.0}, "gravity=-2.0 must be at least 0"),
-    ],
-)
-def test_wrong_physics_is_refused(wrong: dict, message: str) -> None:
-    with pytest.raises(ValueError, match=message):
-        PhysicsConfig(**wrong)
