@@ -14,9 +14,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
-from envs_host import _channel as codes
-from envs_host._channel import Channel, HungUp
-from envs_host._memory import Failure, Setup
+from envs_host import channel as codes
+from envs_host.channel import Channel, HungUp
+from envs_host.memory import Failure, Setup
 
 # Environments do one thing each; threads of their libraries would only fight for the cores.
 ONE_THREAD = {

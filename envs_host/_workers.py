@@ -10,10 +10,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from envs_host import _channel as codes
-from envs_host._episodes import Episodes
-from envs_host._memory import Format, Setup, SharedArrays, new_memory
+from envs_host import channel as codes
 from envs_host._process import Lost, WorkerProcess, exit_all
+from envs_host.episodes import Episodes
+from envs_host.memory import Format, Setup, SharedArrays, new_memory
 
 _LOG = logging.getLogger("envs_host.pool")
 

@@ -23,11 +23,11 @@ from typing import Any
 
 import numpy as np
 
-from envs_host._channel import FIRST_CODE
-from envs_host._episodes import Episodes
-from envs_host._memory import Setup
 from envs_host._workers import ReplayMismatch, WorkerError, Workers
-from envs_host.settings import PoolSettings, WorkerDeath
+from envs_host.channel import FIRST_CODE
+from envs_host.episodes import Episodes
+from envs_host.memory import Setup
+from envs_host.protocol import PoolSettings, WorkerDeath
 
 __all__ = ["HostPool", "HostStep", "PoolSettings", "ReplayMismatch", "WorkerError"]
 

@@ -22,9 +22,9 @@ from typing import Any
 
 import numpy as np
 
-from envs_host import _channel as codes
-from envs_host._channel import Channel, HungUp
-from envs_host._memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
+from envs_host import channel as codes
+from envs_host.channel import Channel, HungUp
+from envs_host.memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
 from envs_host.protocol import HostEnvironment, load_factory
 
 # A worker in the middle of a step gets this long to finish once the pool's process is gone.

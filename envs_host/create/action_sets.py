@@ -1,4 +1,4 @@
-"""The tools that an episode offers (spec create 8.2). NumPy only."""
+"""The tools that an episode offers (docs/create.md, "Action sets"). NumPy only."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""From tools and from the objects of a level to things in the world (spec create 2.1, 5.3)."""
+"""From tools and from the objects of a level to things in the world."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from envs_host.create import things
-from envs_host.create.handlers import Point
+from envs_host.create.geometry import Point
 from envs_host.create.sprites import Tone
 from envs_host.create.things import Thing
 from envs_host.create.tools.catalogue import POLYGON_SIDES, Tool, ToolClass

@@ -1,4 +1,4 @@
-"""Colours of CREATE's pictures (spec create 7.2).
+"""Colours of CREATE's pictures (docs/create.md, "Observation").
 
 The release drew on an 8-bit surface: red and green have 8 levels, blue has 4. Agents saw those
 colours, so observations use them; pictures for people use the colours that were meant. The gray of

@@ -1,24 +1,55 @@
-"""Settings of CREATE (spec create 10); the defaults made the paper's numbers."""
+"""Settings of CREATE, checked; the defaults made the paper's numbers."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field, fields
+from typing import Any, Literal, get_args
 
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.tools import no_op_id, published_split
 from envs_host.create.tools.catalogue import ANALYSIS_SPACING_DEG, DEFAULT_SPACING_DEG
-from envs_host.create.tools.splits import PUBLISHED_SPLITS, analysis_split
-from jaxnew.actions import SPLIT_NAMES, ActionSplit
+from envs_host.create.tools.splits import analysis_split
+from jaxnew.actions import ActionSplit
 
-OBSERVATIONS = ("gray", "rgb", "none")
-ACTION_IDS = ("set", "universe")
-SPLITS = (*PUBLISHED_SPLITS, "analysis")
-SPLIT_PARTS = (*SPLIT_NAMES, "all")
+FanFrame = Literal["body", "world"]
+FrameWalls = Literal["level", "on", "off"]
+Split = Literal["default", "full", "analysis"]
+SplitPart = Literal["train", "validation", "test", "all"]
+ActionIds = Literal["set", "universe"]
+Observation = Literal["gray", "rgb", "none"]
+
+
+@dataclass(frozen=True)
+class PhysicsConfig:
+    """Physics of the world (docs/create.md, "World").
+
+    Attributes:
+      gravity: units/s^2 downwards.
+      substeps: `Space.step` calls of 1/30 s in one action.
+      fan_frame: frame of a fan's force: "body" turns with the object (the release that made the
+        paper's numbers), "world" does not (the later release).
+      bucket_zeroes_velocity: whether a caught object's velocity is zeroed on every substep (the
+        later release) or grows (the paper's).
+
+    Raises:
+      ValueError: a value is not as above, `gravity` is negative or `substeps` below 1.
+    """
+
+    gravity: float = 2.0
+    substeps: int = 40
+    fan_frame: FanFrame = "body"
+    bucket_zeroes_velocity: bool = False
+
+    def __post_init__(self) -> None:
+        _check_range(self, "gravity", 0)
+        _check_range(self, "substeps", 1)
+        _check_choice(self, "fan_frame", FanFrame)
 
 
 @dataclass(frozen=True)
 class RewardConfig:
-    """Rewards (spec create 6.1). A level may override goal, subgoal and target_hit.
+    """Rewards (docs/create.md, "Rewards"). A level may override goal, subgoal and target_hit.
 
     Attributes:
       alive: every action.
@@ -26,11 +57,14 @@ class RewardConfig:
       target_hit: once, in marker levels.
       blocked, invalid, no_op: added when a placement is blocked, out of range, or the no-op.
       marker_lost: added when the marker leaves the world before the target was hit.
-      per_tool_discount: not in the paper (A3).
-      with_subgoals: False sets subgoal and target-hit rewards to 0 in every level (6.6).
-      dense_scale: s of the dense variant (6.6), 0 for none; the release's "dense" is 0.1. While
-        the goal is not credited, each action adds s times the decrease, since the episode's start,
-        of the distance target-goal if the target is armed, and of target-marker in marker levels.
+      per_tool_discount: of the release; the paper does not speak of it.
+      with_subgoals: False sets subgoal and target-hit rewards to 0 in every level.
+      dense_scale: s of the dense variant, 0 for none; the release's "dense" is 0.1. While the goal
+        is not credited, each action adds s times the decrease, since the episode's start, of the
+        distance target-goal if the target is armed, and of target-marker in marker levels.
+
+    Raises:
+      ValueError: a reward is not finite, or `per_tool_discount` or `dense_scale` is negative.
     """
 
     alive: float = 0.01
@@ -45,6 +79,11 @@ class RewardConfig:
     with_subgoals: bool = True
     dense_scale: float = 0.0
 
+    def __post_init__(self) -> None:
+        for each in fields(self):
+            is_size = each.name in ("per_tool_discount", "dense_scale")
+            _check_range(self, each.name, 0 if is_size else -math.inf)
+
 
 @dataclass(frozen=True)
 class CreateConfig:
@@ -53,21 +92,25 @@ class CreateConfig:
     Attributes:
       physics: see `PhysicsConfig`.
       rewards: see `RewardConfig`.
-      step_limit: an episode has one action more; 0: the level's limit (A1).
+      step_limit: an episode has one action more; 0: the level's limit.
       stop_speed: units/s; an action at whose end all are slower is quiet, the second one ends.
       min_tool_distance: normalised distance up to which a placed tool blocks the next.
-      move_threshold: displacement of the target, over sqrt(8), that counts as hit.
-      directional_target_hit: whether it must go towards the goal's side (6.6).
-      end_on_goal: whether reaching the goal ends the episode (A2).
+      move_threshold: displacement of the target, over sqrt(8), that counts as hit; at most 1, the
+        world's diagonal.
+      directional_target_hit: whether it must go towards the goal's side.
+      end_on_goal: whether reaching the goal ends the episode: the paper's text, not its release.
       frame_walls: "level": as the level says; "on" or "off".
       split, split_part: which tools action sets are drawn from.
-      action_set_size: entries of a set, the no-op included (8.2).
+      action_set_size: entries of a set, the no-op included.
       action_ids: "set": an action's index is a place in this episode's set. "universe": it is a
         tool's id and no set is drawn (the rollout owns the sets).
       observation: "gray" uint8[84, 84], "rgb" uint8[84, 84, 3], or "none" (physics only).
       render_size: pixels of an observation's side.
       task_id: 0 or more: freezes the noise of the level, a layout per id; -1: new noise in every
         episode.
+
+    Raises:
+      ValueError: a value is no choice, or out of its range.
     """
 
     physics: PhysicsConfig = field(default_factory=PhysicsConfig)
@@ -78,36 +121,46 @@ class CreateConfig:
     move_threshold: float = 0.03
     directional_target_hit: bool = False
     end_on_goal: bool = False
-    frame_walls: str = "level"
-    split: str = "default"
-    split_part: str = "train"
+    frame_walls: FrameWalls = "level"
+    split: Split = "default"
+    split_part: SplitPart = "train"
     action_set_size: int = 50
-    action_ids: str = "set"
-    observation: str = "gray"
+    action_ids: ActionIds = "set"
+    observation: Observation = "gray"
     render_size: int = 84
     task_id: int = -1
 
     def __post_init__(self) -> None:
         for name, choices in (
-            ("frame_walls", ("level", "on", "off")),
-            ("split", SPLITS),
-            ("split_part", SPLIT_PARTS),
-            ("action_ids", ACTION_IDS),
-            ("observation", OBSERVATIONS),
+            ("frame_walls", FrameWalls),
+            ("split", Split),
+            ("split_part", SplitPart),
+            ("action_ids", ActionIds),
+            ("observation", Observation),
         ):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name}={getattr(self, name)!r} must be one of {choices}.")
+            _check_choice(self, name, choices)
         for name, low in (
             ("step_limit", 0),
             ("stop_speed", 0),
             ("min_tool_distance", 0),
-            ("move_threshold", 0),
             ("action_set_size", 2),
             ("render_size", 1),
             ("task_id", -1),
         ):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name}={getattr(self, name)} must be at least {low}.")
+            _check_range(self, name, low)
+        _check_range(self, "move_threshold", 0, 1)
+
+    @classmethod
+    def from_plain(cls, plain: Mapping[str, Any]) -> CreateConfig:
+        """The config of nested dictionaries, as `dataclasses.asdict` gives them.
+
+        Raises:
+          TypeError: there is no such field.
+          ValueError: a value is out of its range.
+        """
+        physics = PhysicsConfig(**plain.get("physics", {}))
+        rewards = RewardConfig(**plain.get("rewards", {}))
+        return cls(**{**plain, "physics": physics, "rewards": rewards})
 
     @property
     def angle_spacing(self) -> int:
@@ -121,3 +174,17 @@ class CreateConfig:
     def action_split(self) -> ActionSplit:
         """The split by name; ids belong to the list of `angle_spacing`."""
         return analysis_split() if self.split == "analysis" else published_split(self.split)
+
+
+def _check_choice(config: object, name: str, choices: Any) -> None:
+    value = getattr(config, name)
+    if value not in get_args(choices):
+        raise ValueError(f"{name}={value!r} must be one of {get_args(choices)}.")
+
+
+def _check_range(config: object, name: str, low: float, high: float = math.inf) -> None:
+    value = getattr(config, name)
+    if not (low <= value <= high and math.isfinite(value)):
+        limits = "finite" if math.isinf(low) else f"at least {low} and finite"
+        limits += "" if math.isinf(high) else f", at most {high}"
+        raise ValueError(f"{name}={value} must be {limits}.")

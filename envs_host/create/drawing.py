@@ -1,7 +1,7 @@
-"""Pictures of a world: what the agent sees, and what people look at (spec create 7, 10).
+"""Pictures of a world, for agents and for people (docs/create.md, "Observation").
 
-Every picture is mirrored left-right, as all pictures of the release are (A9): the top left corner
-shows the world's (+1, +1).
+Every picture is mirrored left-right, as all pictures of the release are: the top left corner shows
+the world's (+1, +1).
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ def draw(
     Args:
       sprites: see `sprites`; what lies outside the world is cut off.
       mode: "gray" and "rgb" are observations, one pixel per unit at size 84, not smoothed. Their
-        gray is the one of spec create 7.2 ("gray seen"), rounded; rgb has the 8-bit colours that
-        gave those grays. "people" is smooth and has the nominal colours.
+        rgb has the release's 8-bit colours, their gray is rounded. "people" is smooth and has the
+        nominal colours.
       size: pixels of the side; default 84, for people 1024.
       extras: for people only, see `illustration.illustrate`.
 

@@ -1,4 +1,4 @@
-"""CREATE as a Gymnasium environment (spec create 7, 8, 10)."""
+"""CREATE as a Gymnasium environment (docs/create.md)."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The rules of one episode: what an action earns and when it is over (spec create 1.6-1.8, 6)."""
+"""The rules of one episode: what an action earns, when it is over (docs/create.md, "Actions")."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class Outcome:
 class Episode:
     """An episode under way. An action is `simulate`, then (after drawing) `judge`.
 
-    The picture of an action still shows the subgoals that `judge` then removes (1.6).
+    The picture of an action still shows the subgoals that `judge` then removes.
     """
 
     def __init__(self, layout: Layout, config: CreateConfig) -> None:
@@ -101,12 +101,12 @@ class Episode:
         watch: Callable[[World], None] | None = None,
         watch_every: int = 4,
     ) -> None:
-        """Tries to place the tool and runs the world (1.6, steps 2 and 3)."""
+        """Tries to place the tool and runs the world."""
         self._placement = self.world.place(tool, clip(position))
         self.world.run(self.config.physics.substeps, watch, watch_every)
 
     def judge(self) -> Outcome:
-        """Rewards and ends of the action just simulated (1.6, steps 1 and 5 to 8)."""
+        """Rewards and ends of the action just simulated."""
         summary = self.summary
         reward = self.config.rewards.alive + self._placement_reward()
         summary.length += 1
@@ -137,24 +137,24 @@ class Episode:
         return 0.0 if name == "placed" else getattr(self.config.rewards, name)
 
     def _discount(self) -> float:
-        """How much less a goal or subgoal is worth by now: 0.1 per placed tool (6.1)."""
+        """How much less a goal or subgoal is worth by now: 0.1 per placed tool."""
         return self.config.rewards.per_tool_discount * self.summary.num_placed
 
     def _common_ends(self, now: Positions) -> list[End]:
-        """The ends that every kind of level has (1.7)."""
+        """The ends that every kind of level has."""
         ends = []
         if self.summary.length > self.step_limit:
             ends.append(End.STEP_LIMIT)
         if not is_in_bounds(now.target):
             ends.append(End.TARGET_OUT)
-        # Never reset: the second quiet action ends, consecutive or not (A24).
+        # Never reset: the second quiet action ends, consecutive or not.
         self._num_quiet += self.world.is_still(self.config.stop_speed)
         if self._num_quiet > _QUIET_ACTIONS_ALLOWED:
             ends.append(End.STILL)
         return ends
 
     def _judge_marker(self, now: Positions, ends: list[End]) -> float:
-        """The target's first hit, then the marker's bounds (1.6, step 8)."""
+        """The target's first hit, then the marker's bounds."""
         reward = 0.0
         if self.summary.target_hit == 0 and self._is_target_hit(now.target):
             self.summary.target_hit = 1
@@ -166,7 +166,7 @@ class Episode:
         return reward
 
     def _is_target_hit(self, now: Point) -> bool:
-        """Whether the target, now here, has moved, and by the marker if it must (6.4)."""
+        """Whether the target, now here, has moved, and by the marker if it must."""
         start = self._start.target
         has_moved = scaled_distance(start, now) > self.config.move_threshold
         if self.level.marker_must_hit_target:
@@ -177,7 +177,7 @@ class Episode:
         return has_moved
 
     def _dense_reward(self, now: Positions, is_armed: bool) -> float:
-        """The variant of spec create 6.6, before this action's goal is credited."""
+        """The dense variant's part, before this action's goal is credited."""
         scale = self.config.rewards.dense_scale
         if scale == 0.0 or self.summary.goal_hit == 1:
             return 0.0

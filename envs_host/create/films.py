@@ -1,4 +1,4 @@
-"""Pictures and smooth films of an episode, with traces and a line of text (spec create 10)."""
+"""Pictures and smooth films of an episode, with traces and a line of text."""
 
 from __future__ import annotations
 

@@ -88,7 +88,7 @@ def _form(pixels: np.ndarray, size: int, inks: np.ndarray | None = None) -> Form
 
 
 def _centre(sprite: Sprite, size: int) -> Pixel:
-    """Row and column of a position: int(84 - y) and int(x) at size 84 (7.3)."""
+    """Row and column of a position: int(84 - y) and int(x) at size 84."""
     scale = size / WORLD_SIZE
     return int(size - sprite.y * scale), int(sprite.x * scale)
 

@@ -1,4 +1,4 @@
-"""World units and normalised coordinates (spec create 1.1)."""
+"""World units and normalised coordinates."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 WORLD_SIZE = 84.0
 
-# Distances are reported in units of the longest one, the square's diagonal (spec create 6.2, 6.4).
+# Distances are reported in units of the longest one, the square's diagonal.
 DIAGONAL = math.sqrt(8.0)
 
 Point = tuple[float, float]
@@ -28,10 +28,10 @@ def clip(position: Point) -> Point:
 
 
 def is_in_bounds(position: Point) -> bool:
-    """Whether a centre, in units, is strictly inside the world (1.2)."""
+    """Whether a centre, in units, is strictly inside the world."""
     return 0.0 < position[0] < WORLD_SIZE and 0.0 < position[1] < WORLD_SIZE
 
 
 def scaled_distance(first: Point, second: Point) -> float:
-    """Distance of two positions in units: clipped, normalised, over sqrt(8) (6.4)."""
+    """Distance of two positions in units: clipped, normalised, over sqrt(8)."""
     return math.dist(clip(to_normalised(first)), clip(to_normalised(second))) / DIAGONAL

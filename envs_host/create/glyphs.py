@@ -1,4 +1,4 @@
-"""Small pictures of what is more than one tone, as observations show it (spec create 7.2).
+"""Small pictures of what is more than one tone, as observations show it.
 
 They are our own; ink and mean gray are those that the release's pictures had after scaling.
 A glyph stands around a corner of pixels. Pixels are (row, column), see `raster`.
@@ -16,7 +16,7 @@ from envs_host.create.colors import Ink
 from envs_host.create.raster import line
 from envs_host.create.sprites import Kind, Sprite
 
-_CANNON_BOX = (11.566, 12.362)  # Of the region, the same for all aims (spec create 2.4).
+_CANNON_BOX = (11.566, 12.362)  # Of the region, the same for all aims.
 _BARREL = (12.2, 8.6)
 _LONG_LADDER = 17.5
 _BELT_PATTERN = (Ink.BELT_DARK, Ink.BELT_LIGHT, Ink.BELT_LIGHT, Ink.WHITE)

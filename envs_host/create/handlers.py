@@ -1,4 +1,4 @@
-"""What tools do to moving objects that touch them (spec create 2.4-2.8).
+"""What tools do to moving objects that touch them (docs/create.md, "What a tool does").
 
 Every callback is registered for (moving object, tool), so `arbiter.shapes` comes in that order
 whatever the engine found first. pymunk keeps `process_collision` until it is set again, so
@@ -15,7 +15,7 @@ from typing import Any
 
 import pymunk
 
-Point = tuple[float, float]
+from envs_host.create.geometry import Point
 
 
 class Contact(IntEnum):
@@ -89,7 +89,7 @@ class Ledger:
     Attributes:
       zeroes_velocity: whether buckets zero the velocity of what they hold on every substep.
       laws: what the shape of a tool does to moving objects.
-      caught: shapes that a bucket has caught; the mark is never cleared (2.7).
+      caught: shapes that a bucket has caught; the mark is never cleared.
       met: pairs of shapes that have begun to touch: goal with moving, moving with moving.
       inside: (moving, subgoal) shapes that touch now.
     """
@@ -105,7 +105,7 @@ Callback = Callable[[pymunk.Arbiter, pymunk.Space, Ledger], None]
 
 
 def fire(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Cannon: what enters the region is put at the muzzle and shot (spec create 2.4)."""
+    """Cannon: what enters the region is put at the muzzle and shot."""
     shape, region = arbiter.shapes
     law = ledger.laws[region]
     put_to_rest(shape.body, law.muzzle)
@@ -113,25 +113,25 @@ def fire(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
 
 
 def blow(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Fan: a force in the frame of the object, which turns as it rolls (2.5, A5)."""
+    """Fan: a force in the frame of the object, which turns as it rolls."""
     shape, region = arbiter.shapes
     shape.body.apply_force_at_local_point(ledger.laws[region].force)
 
 
 def blow_in_world_frame(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Fan: a force in the frame of the world (2.5, the stand-alone release)."""
+    """Fan: a force in the frame of the world, as in the later release."""
     shape, region = arbiter.shapes
     shape.body.apply_force_at_world_point(ledger.laws[region].force, shape.body.position)
 
 
 def carry(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Belt and ladder: the velocity is overwritten (2.6)."""
+    """Belt and ladder: the velocity is overwritten."""
     shape, region = arbiter.shapes
     shape.body.velocity = ledger.laws[region].velocity
 
 
 def catch_in_funnel(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Funnel: from above, through to the tip; else an ordinary block (2.7)."""
+    """Funnel: from above, through to the tip; else an ordinary block."""
     shape, block = arbiter.shapes
     law = ledger.laws[block]
     centre = shape.body.position
@@ -143,9 +143,9 @@ def catch_in_funnel(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger
 
 
 def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Bucket: from above, held in its centre for good; else an ordinary block (2.7).
+    """Bucket: from above, held in its centre for good; else an ordinary block.
 
-    Only the position of what is held is reset, so gravity keeps adding to its velocity (A6).
+    Only the position of what is held is reset, so gravity keeps adding to its velocity.
     """
     shape, block = arbiter.shapes
     law = ledger.laws[block]
@@ -165,7 +165,7 @@ def catch_in_bucket(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger
 
 
 def damp(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Plank: slows balls, and only balls, after the solver (2.8).
+    """Plank: slows balls, and only balls, after the solver.
 
     A factor of 1 is applied, too: writing a velocity keeps the engine from putting a body to sleep.
     """
@@ -187,7 +187,7 @@ def put_to_rest(body: pymunk.Body, position: Point) -> None:
 
 
 def enter_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Keeps account of who is in which subgoal disc now (6.5)."""
+    """Keeps account of who is in which subgoal disc now."""
     ledger.inside.add(arbiter.shapes)
 
 
@@ -196,5 +196,5 @@ def leave_subgoal(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) 
 
 
 def meet(arbiter: pymunk.Arbiter, space: pymunk.Space, ledger: Ledger) -> None:
-    """Remembers which objects have ever begun to touch (6.2, 6.4)."""
+    """Remembers which objects have ever begun to touch."""
     ledger.met.add(frozenset(arbiter.shapes))

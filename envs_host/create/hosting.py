@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.config import CreateConfig
 from envs_host.create.environment import CreateEnv
 from envs_host.protocol import Step
 
@@ -29,14 +28,22 @@ class CreateHost:
 
     Everything in an episode (the noise of the level) follows from the seed of its reset.
 
-    In a pool: `HostPool("envs_host.create.hosting:CreateHost", {"level": "Push"}, ...)`.
+    In a pool, whose arguments are plain:
+
+        config = CreateConfig(action_ids="universe", end_on_goal=True)
+        kwargs = {"level": "Push", "config": dataclasses.asdict(config)}
+        HostPool("envs_host.create.hosting:CreateHost", kwargs, ...)
 
     Args:
       level: name of a level or a level file.
       deterministic: True leaves out the noise of the level's positions.
-      with_subgoals: False sets the rewards of subgoals and of the target's hit to 0.
-      split: name of a split; "analysis" takes ids of the 3-degree list of tools.
-      settings: further fields of `CreateConfig` that are plain values.
+      config: all settings, as a config or in the form of `dataclasses.asdict`; default: the paper's
+        with `action_ids="universe"`. With `split="analysis"`, ids are of the 3-degree list of
+        tools; parts of a split and action sets are the rollout's.
+
+    Raises:
+      LevelError: there is no such level.
+      ValueError: the config has action sets, or no gray frames.
     """
 
     position_dim = 2
@@ -46,17 +53,23 @@ class CreateHost:
         self,
         level: str = "Push",
         deterministic: bool = False,
-        with_subgoals: bool = True,
-        split: str = "default",
-        settings: Mapping[str, Any] | None = None,
+        config: CreateConfig | Mapping[str, Any] | None = None,
     ) -> None:
-        config = CreateConfig(
-            rewards=RewardConfig(with_subgoals=with_subgoals),
-            split=split,
-            action_ids="universe",
-            observation="gray",
-        )
-        self.env = CreateEnv(level, deterministic, replace(config, **(settings or {})))
+        if config is None:
+            config = CreateConfig(action_ids="universe")
+        elif not isinstance(config, CreateConfig):
+            config = CreateConfig.from_plain(config)
+        if config.action_ids != "universe":
+            raise ValueError(
+                f"action_ids={config.action_ids!r} must be 'universe' in a pool: the rollout owns "
+                "the action sets and sends ids of tools."
+            )
+        if config.observation != "gray":
+            raise ValueError(
+                f"observation={config.observation!r} must be 'gray' in a pool: that is what the "
+                "policy looks at."
+            )
+        self.env = CreateEnv(level, deterministic, config)
         self.observation_shape = self.env.observation_space.shape or ()
         self.observation_dtype = np.uint8
 

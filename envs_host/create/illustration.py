@@ -1,4 +1,4 @@
-"""Pictures of a world for people: smooth, with real colours, traces and a line of text (10)."""
+"""Pictures of a world for people: smooth, with real colours, traces and a line of text."""
 
 from __future__ import annotations
 

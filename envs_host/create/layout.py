@@ -1,4 +1,4 @@
-"""Where a level's things start: as written, or with noise (spec create 5.0, 5.2)."""
+"""Where a level's things start: as written, or with noise (docs/create.md, "Levels")."""
 
 from __future__ import annotations
 

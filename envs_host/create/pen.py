@@ -1,4 +1,4 @@
-"""A pen that draws in world units, mirrored and smoothed (spec create 7.1, 10)."""
+"""A pen that draws in world units, mirrored and smoothed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""CREATE's play environment: what each tool does to a ball thrown at it (spec create 9)."""
+"""CREATE's play environment: what a tool does to a ball thrown at it (docs/create.md, "Play")."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from envs_host.create.building import build_tool
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.geometry import DIAGONAL, Point, to_normalised, to_units
 from envs_host.create.sprites import Sprite
-from envs_host.create.stage import PhysicsConfig, Stage
+from envs_host.create.stage import Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import Tool, ToolClass, all_tools
 from envs_host.create.tools.catalogue import DEFAULT_SPACING_DEG
@@ -42,8 +43,8 @@ class PlayConfig:
 
     Attributes:
       angle_spacing: which list the ids belong to.
-      centred: True keeps the tool in the centre and starts the ball near a corner (the option of
-        spec create 9.1); False draws both.
+      centred: True keeps the tool in the centre and starts the ball near a corner; False draws
+        both.
       physics: see `PhysicsConfig`; its `substeps` are not used.
     """
 
@@ -81,7 +82,7 @@ def record_block(
     config: PlayConfig | None = None,
     positions_only: bool = False,
 ) -> np.ndarray:
-    """State recordings of tools (spec create 9).
+    """State recordings of tools.
 
     A tool's recordings depend on the seed, on its id and on their number only, not on the other
     tools of the block; the first S of more recordings are the same.
@@ -91,7 +92,7 @@ def record_block(
       ids: int[n] tool ids of the list with `config.angle_spacing`.
       num_recordings: S, trajectories of each tool; the paper has 1,024.
       config: how; default: the paper's.
-      positions_only: keeps the ball's position alone, the two numbers of the paper's prose (A12).
+      positions_only: keeps the ball's position alone, the two numbers of the paper's prose.
 
     Returns:
       f32[n, S, 7, 6]: tool position and ball position (normalised, the ball's not clipped), ball
@@ -119,7 +120,7 @@ def record_images(
     All frames in memory; `envs_host.create.poses` keeps what they are drawn from instead.
 
     Returns:
-      u8[n, S, 7, 48, 48] gray frames: tool and ball on white, lines at least one pixel wide (A13).
+      u8[n, S, 7, 48, 48] gray frames: tool and ball on white, lines at least one pixel wide.
 
     Raises:
       ValueError: an id does not exist, or there is nothing to record.
@@ -161,7 +162,7 @@ def record_worlds(
 def mean_trials(
     seed: int, tool_class: ToolClass, num_recordings: int, config: PlayConfig | None = None
 ) -> float:
-    """Mean number of trials over recordings of random tools of one class (spec create 9.4)."""
+    """Mean number of trials over recordings of random tools of one class."""
     config = config or PlayConfig()
     ids = [tool.id for tool in all_tools(config.angle_spacing) if tool.tool_class == tool_class]
     rng = np.random.default_rng(seed)
@@ -185,12 +186,12 @@ def _record_tools(
 
 
 def _record(rng: np.random.Generator, tool: Tool, config: PlayConfig) -> Recording:
-    """Throws balls at one tool until one touches it, eight at most (9.2)."""
+    """Throws balls at one tool until one touches it, eight at most."""
     tool_position = (0.0, 0.0) if config.centred else _uniform(rng, _TOOL_RANGE)
     throw: _Throw | None = None
     for trial in range(MAX_TRIALS):
         fresh = _Throw(rng, tool, tool_position, trial, config)
-        while fresh.overlaps and trial == MAX_TRIALS - 1:  # The release crashes here (9.4).
+        while fresh.overlaps and trial == MAX_TRIALS - 1:  # The release crashes here.
             fresh = _Throw(rng, tool, tool_position, trial, config)
         if fresh.overlaps:
             continue
@@ -248,7 +249,7 @@ class _Throw:
                 self.has_contact = True
 
     def window(self) -> tuple[Snapshot, ...]:
-        """Seven of the nine states: three on both sides of the contact, as far as there are (9.3).
+        """Seven of the nine states: three on both sides of the contact, as far as there are.
 
         Without a contact the middle seven.
         """
@@ -283,7 +284,7 @@ def _ball_start(rng: np.random.Generator, centred: bool) -> Point:
 
 
 def _velocity(rng: np.random.Generator, start: Point, target: Point, trial: int) -> Point:
-    """Towards the tool's centre, faster from afar and in later trials (9.2 c); units/s."""
+    """Towards the tool's centre, faster from afar and in later trials; units/s."""
     distance = math.dist(start, target)
     speed = float(rng.uniform(*_SPEED_RANGE)) * _SPEED
     speed *= (1.0 + _SPEED_PER_TRIAL * trial) * (1.0 + distance)

@@ -1,4 +1,4 @@
-"""How each kind of thing looks to people (spec create 7.2, 10); the drawings are our own."""
+"""How each kind of thing looks to people; the drawings are our own."""
 
 from __future__ import annotations
 

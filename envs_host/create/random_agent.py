@@ -1,4 +1,4 @@
-"""What a uniformly random agent achieves, beside the release's numbers (spec create 12, check 26).
+"""What a uniformly random agent achieves, beside the release's numbers.
 
     python -m envs_host.create.random_agent --episodes 600 --seed 0 [--levels Push,Funnel]
 

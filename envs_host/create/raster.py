@@ -1,4 +1,4 @@
-"""Which pixels a form covers, at one pixel per unit or any other scale (spec create 7.3).
+"""Which pixels a form covers, at one pixel per unit or any other scale.
 
 Pixels are (row, column) with row 0 on top and columns along +x: not mirrored yet. Functions return
 int arrays [n, 2]; pixels may lie outside the picture.
@@ -13,8 +13,8 @@ import numpy as np
 Pixel = tuple[int, int]
 
 # A disc covers the pixels whose centres are nearer to its centre, a corner of pixels, than its
-# radius less this. It gives the figures of spec create 7.3: rows 2 4 6 6 4 2 for radius 3,
-# 2 6 6 8 8 6 6 2 for 4, and 232 pixels for 9. The smallest disc has 2 x 2 pixels.
+# radius less this. It gives the figures of the release: rows 2 4 6 6 4 2 for radius 3, 2 6 6 8 8 6
+# 6 2 for 4, and 232 pixels for 9. The smallest disc has 2 x 2 pixels.
 _DISC_SHRINKAGE = 0.4
 _SMALLEST_DISC = 0.75
 

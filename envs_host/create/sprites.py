@@ -1,8 +1,8 @@
 """What a world looks like, without a single pixel: the list that a renderer draws.
 
-Draw order (spec create 5.0, 7.1): target, goal, placed tools in the order of placement, level
-objects as listed in the level (the marker of a marker task is the first of them), subgoals of the
-marker, subgoals of the target, frame walls (right, left, top). Later sprites cover earlier ones.
+Draw order: target, goal, placed tools in the order of placement, level objects as listed in the
+level (the marker of a marker task is the first of them), subgoals of the marker, subgoals of the
+target, frame walls (right, left, top). Later sprites cover earlier ones.
 `World.sprites()` yields them in this order; a renderer draws them one after another on a white
 ground and sorts nothing. Reached subgoals are no longer yielded.
 """
@@ -36,7 +36,7 @@ class Kind(StrEnum):
 
 
 class Tone(StrEnum):
-    """Row of the tables of tones (spec create 7.2); gray levels and colours are the renderer's."""
+    """What a sprite is coloured as; gray levels and colours are the renderer's."""
 
     TARGET = "target"
     MARKER = "marker"
@@ -92,7 +92,7 @@ class Sprite(NamedTuple):
       angle: radians, counter-clockwise, not reduced to one turn.
       size, width: units.
       sides: number of corners, where it matters.
-      tone: which tone; `picture` for things that are more than one tone (second table there).
+      tone: which tone; `picture` for things that are more than one tone.
     """
 
     kind: Kind

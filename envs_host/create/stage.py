@@ -1,43 +1,16 @@
-"""A pymunk space that knows CREATE's tools: add things, run substeps (spec create 1.1, 2)."""
+"""A pymunk space that knows CREATE's tools: add things, run substeps."""
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import pymunk
 
 from envs_host.create import handlers
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.handlers import Contact, Ledger
 from envs_host.create.things import Thing
 
 SUBSTEP_S = 1.0 / 30.0
 SLEEP_TIME_S = 0.3
-FAN_FRAMES = ("body", "world")
-
-
-@dataclass(frozen=True)
-class PhysicsConfig:
-    """Physics of the world (spec create 1.1, 11).
-
-    Attributes:
-      gravity: units/s^2 downwards.
-      substeps: `Space.step` calls of 1/30 s in one action.
-      fan_frame: frame of a fan's force: "body" turns with the object (the release that made the
-        paper's numbers), "world" does not (the later one; ambiguity A5).
-      bucket_zeroes_velocity: whether a caught object's velocity is zeroed on every substep (the
-        later release; A6) or grows (the paper's).
-    """
-
-    gravity: float = 2.0
-    substeps: int = 40
-    fan_frame: str = "body"
-    bucket_zeroes_velocity: bool = False
-
-    def __post_init__(self) -> None:
-        if self.substeps < 1:
-            raise ValueError(f"substeps={self.substeps} must be at least 1.")
-        if self.fan_frame not in FAN_FRAMES:
-            raise ValueError(f"fan_frame={self.fan_frame!r} must be one of {FAN_FRAMES}.")
 
 
 class Stage:

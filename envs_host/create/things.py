@@ -1,4 +1,4 @@
-"""The objects of a world: bodies, shapes, what they do and how they look (spec create 1.3-1.5, 2).
+"""The objects of a world: bodies, shapes, what they do and how they look (docs/create.md, "World").
 
 Lengths are world units, angles radians, positions world units unless a name says otherwise.
 """
@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 
 import pymunk
 
+from envs_host.create.geometry import Point
 from envs_host.create.handlers import (
     BucketLaw,
     CannonLaw,
@@ -20,14 +21,13 @@ from envs_host.create.handlers import (
     FunnelLaw,
     Law,
     PlankLaw,
-    Point,
 )
 from envs_host.create.sprites import Kind, Sprite, Tone
 
 TRAMPOLINE_THICKNESS = 2.0
 _STAR_INNER_SHARE = 0.5
 _CANNON_SIZE = (7.3, 10.0)
-_CANNON_TURN = 10.0  # Radians, for every aim: a slip of the release that shaped all data (A7).
+_CANNON_TURN = 10.0  # Radians, for every aim: a slip of the release that shaped all data.
 _CANNON_MUZZLE = (5.0, 3.65)
 _FAN_SIZE = (6.7, 10.0)
 _PLANK_MASS = 10.0
@@ -87,7 +87,7 @@ def ball(
     friction: float = 1.0,
     kind: Kind = Kind.DISC,
 ) -> Thing:
-    """A dynamic disc at rest (1.4)."""
+    """A dynamic disc at rest."""
     body = pymunk.Body(mass, pymunk.moment_for_circle(mass, 0.0, radius))
     body.position = position
     shape = _surface(pymunk.Circle(body, radius), elasticity, friction, Contact.MOVING)
@@ -97,7 +97,7 @@ def ball(
 def dynamic_box(
     position: Point, side: float, mass: float, elasticity: float, friction: float
 ) -> Thing:
-    """A dynamic square at rest (1.4)."""
+    """A dynamic square at rest."""
     body = pymunk.Body(mass, pymunk.moment_for_box(mass, (side, side)))
     body.position = position
     shape = pymunk.Poly.create_box(body, (side, side))
@@ -106,7 +106,7 @@ def dynamic_box(
 
 
 def star(position: Point, radius: float) -> Thing:
-    """A fixed goal: a sensor with the hull of a five-pointed star (1.5)."""
+    """A fixed goal: a sensor with the hull of a five-pointed star."""
     body = _static(position)
     corners = _corners(5, radius, math.pi / 2.0)
     shape = _sensor(pymunk.Poly(body, corners), Contact.GOAL)
@@ -116,7 +116,7 @@ def star(position: Point, radius: float) -> Thing:
 
 
 def basket(position: Point, side: float) -> Thing:
-    """The square sensor of the Basket task (1.5)."""
+    """The square sensor of the Basket task."""
     body = _static(position)
     shape = _sensor(pymunk.Poly.create_box(body, (side, side)), Contact.GOAL)
     sprite = Sprite(Kind.BASKET_GOAL, *position, 0.0, side, Tone.PICTURE)
@@ -124,7 +124,7 @@ def basket(position: Point, side: float) -> Thing:
 
 
 def subgoal(position: Point, radius: float) -> Thing:
-    """A sensor disc (1.5)."""
+    """A sensor disc."""
     body = _static(position)
     shape = _sensor(pymunk.Circle(body, radius), Contact.SUBGOAL)
     return Thing(body, shape, ((None, Sprite(Kind.SUBGOAL, *position, 0.0, radius, Tone.SUBGOAL)),))
@@ -140,7 +140,7 @@ def bar(
     tone: Tone,
     kind: Kind = Kind.BAR,
 ) -> Thing:
-    """A static segment whose collision radius is floor(thickness / 2) (1.3, 2.2)."""
+    """A static segment whose collision radius is floor(thickness / 2)."""
     body = _static(position)
     shape = _segment(body, angle, length, math.floor(thickness / 2.0))
     _surface(shape, elasticity, friction, Contact.PLAIN)
@@ -151,13 +151,13 @@ def bar(
 def trampoline(
     position: Point, angle: float, length: float, elasticity: float, friction: float = 1.0
 ) -> Thing:
-    """A bar that looks like a trampoline (2.2)."""
+    """A bar that looks like a trampoline."""
     thickness, kind = TRAMPOLINE_THICKNESS, Kind.TRAMPOLINE
     return bar(position, angle, length, thickness, elasticity, friction, Tone.PICTURE, kind)
 
 
 def disc(position: Point, radius: float, elasticity: float, friction: float, tone: Tone) -> Thing:
-    """A static disc (2.3)."""
+    """A static disc."""
     body = _static(position)
     shape = _surface(pymunk.Circle(body, radius), elasticity, friction, Contact.PLAIN)
     return Thing(body, shape, ((None, Sprite(Kind.DISC, *position, 0.0, radius, tone)),))
@@ -172,7 +172,7 @@ def polygon(
     friction: float,
     tone: Tone,
 ) -> Thing:
-    """A static regular polygon of circumradius `radius` (1.3, 2.3)."""
+    """A static regular polygon of circumradius `radius`."""
     body = _static(position)
     shape = pymunk.Poly(body, _corners(sides, radius, angle))
     _surface(shape, elasticity, friction, Contact.PLAIN)
@@ -183,7 +183,7 @@ def polygon(
 def static_box(
     position: Point, side: float, elasticity: float, friction: float, tone: Tone
 ) -> Thing:
-    """A static axis-aligned square, given by its side (2.3)."""
+    """A static axis-aligned square, given by its side."""
     body = _static(position)
     shape = pymunk.Poly.create_box(body, (side, side))
     _surface(shape, elasticity, friction, Contact.PLAIN)
@@ -193,7 +193,7 @@ def static_box(
 
 
 def cannon(position: Point, aim: float, impulse: float) -> Thing:
-    """A region that shoots what enters it (2.4)."""
+    """A region that shoots what enters it."""
     body = _static(position)
     shape = _sensor(pymunk.Poly(body, _rectangle(_CANNON_SIZE, _CANNON_TURN)), Contact.CANNON)
     along = (math.cos(aim), math.sin(aim))
@@ -208,7 +208,7 @@ def cannon(position: Point, aim: float, impulse: float) -> Thing:
 
 
 def fan(position: Point, angle: float, force: float) -> Thing:
-    """A region in which a force acts (2.5)."""
+    """A region in which a force acts."""
     body = _static(position)
     shape = _sensor(pymunk.Poly(body, _rectangle(_FAN_SIZE, angle)), Contact.FAN)
     law = FanLaw((force * math.cos(angle), force * math.sin(angle)))
@@ -218,18 +218,18 @@ def fan(position: Point, angle: float, force: float) -> Thing:
 
 
 def belt(position: Point, length: float, velocity: Point) -> Thing:
-    """A horizontal bar that carries what touches it (2.6)."""
+    """A horizontal bar that carries what touches it."""
     direction = 0.0 if velocity[0] >= 0.0 else math.pi
     return _conveyor(position, 0.0, length, velocity, Kind.BELT, direction)
 
 
 def ladder(position: Point, angle: float, length: float, velocity: Point) -> Thing:
-    """An upright bar that carries what touches it (2.6)."""
+    """An upright bar that carries what touches it."""
     return _conveyor(position, angle, length, velocity, Kind.LADDER, angle)
 
 
 def funnel(position: Point, angle: float, radius: float) -> Thing:
-    """A triangle that lets through to its tip what comes from above (2.7)."""
+    """A triangle that lets through to its tip what comes from above."""
     body = _static(position)
     degrees = (150.0, 270.0, 30.0)
     offsets = [_on_circle(radius, math.radians(degree) + angle) for degree in degrees]
@@ -240,7 +240,7 @@ def funnel(position: Point, angle: float, radius: float) -> Thing:
 
 
 def bucket(position: Point, angle: float, radius: float) -> Thing:
-    """A square that holds what comes from above (2.7)."""
+    """A square that holds what comes from above."""
     body = _static(position)
     degrees = (135.0, 225.0, 315.0, 45.0)
     offsets = [_on_circle(radius, math.radians(degree) + angle) for degree in degrees]
@@ -252,19 +252,19 @@ def bucket(position: Point, angle: float, radius: float) -> Thing:
 
 
 def lever(position: Point, length: float, friction: float) -> Thing:
-    """A plank that turns freely about its middle (2.8)."""
+    """A plank that turns freely about its middle."""
     return _plank(position, length, friction, start_angle=0.0, max_angle=None)
 
 
 def limited_seesaw(position: Point, length: float, max_angle: float, friction: float) -> Thing:
-    """A plank with a soft stop (2.8)."""
+    """A plank with a soft stop."""
     return _plank(position, length, friction, start_angle=0.0, max_angle=max_angle)
 
 
 def weighted_seesaw(
     position: Point, length: float, max_angle: float, weight_side: str, weight_mass: float
 ) -> Thing:
-    """A plank with a stop and a weight, which starts with the weight down (2.8)."""
+    """A plank with a stop and a weight, which starts with the weight down."""
     sign = 1.0 if weight_side == "right" else -1.0
     start_angle = -sign * max_angle
     plank = _plank(position, length, 1.0, start_angle, max_angle)
@@ -336,7 +336,7 @@ def _sensor(shape: pymunk.Shape, contact: Contact) -> pymunk.Shape:
 
 
 def _corners(sides: int, radius: float, angle: float) -> list[Point]:
-    """Vertices at angle + 2 pi k / n, k = 1..n (1.3)."""
+    """Vertices at angle + 2 pi k / n, k = 1..n."""
     return [_on_circle(radius, angle + 2.0 * math.pi * k / sides) for k in range(1, sides + 1)]
 
 

@@ -1,4 +1,4 @@
-"""A level's world: its objects, the tools placed in it, who has touched what (spec create 1, 5, 6).
+"""A level's world: its objects, the tools placed in it, who has touched what.
 
 `drop_test` is the smallest world of all: one tool, one ball.
 """
@@ -15,11 +15,12 @@ import pymunk
 
 from envs_host.create import things
 from envs_host.create.building import build_object, build_tool
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.geometry import Point, to_units
 from envs_host.create.layout import Layout
 from envs_host.create.levels.schema import MARKER_TYPE, BallSpec, GoalSpec
 from envs_host.create.sprites import Kind, Sprite, Tone
-from envs_host.create.stage import PhysicsConfig, Stage
+from envs_host.create.stage import Stage
 from envs_host.create.things import Thing
 from envs_host.create.tools import Tool, ToolClass, all_tools
 
@@ -35,7 +36,7 @@ _FRAME = (((1.0, 0.0), 90.0), ((-1.0, 0.0), 90.0), ((0.0, 1.0), 0.0))
 
 
 class Placement(StrEnum):
-    """What became of an attempt to place a tool (6.3)."""
+    """What became of an attempt to place a tool."""
 
     PLACED = "placed"
     NO_OP = "no_op"
@@ -70,7 +71,7 @@ class World:
         frame_walls: bool,
         min_tool_distance: float,
     ) -> None:
-        """Builds the world in the fixed order of spec create 5.0.
+        """Builds the world in a fixed order, on which the engine's last digits depend.
 
         Args:
           layout: a level and this episode's offsets.
@@ -107,11 +108,11 @@ class World:
         return Positions(tuple(self.target.body.position), marker, tuple(self.goal.body.position))
 
     def check_placement(self, tool: Tool, position: Point) -> Placement:
-        """What `place` would answer, without doing it (6.3)."""
+        """What `place` would answer, without doing it."""
         return self._try(tool, position)[0]
 
     def place(self, tool: Tool, position: Point) -> Placement:
-        """Places a tool if the tests of spec create 6.3 allow it.
+        """Places a tool if it may be placed (docs/create.md, "Placement").
 
         Args:
           tool: any tool.
@@ -139,16 +140,16 @@ class World:
 
     @property
     def has_touched_goal(self) -> bool:
-        """Whether target and goal have begun to touch in any substep so far (6.2)."""
+        """Whether target and goal have begun to touch in any substep so far."""
         return self.stage.have_met(self.target, self.goal)
 
     @property
     def has_marker_hit_target(self) -> bool:
-        """Whether marker and target have begun to touch in any substep so far (6.4)."""
+        """Whether marker and target have begun to touch in any substep so far."""
         return self.marker is not None and self.stage.have_met(self.marker, self.target)
 
     def take_reached_subgoals(self) -> int:
-        """Removes the subgoals that are touched now by who must touch them; how many (6.5)."""
+        """Removes the subgoals that are touched now by who must touch them; how many."""
         num_reached = 0
         for who, subgoals in (
             (self.marker, self.marker_subgoals),
@@ -164,7 +165,7 @@ class World:
     def is_still(self, stop_speed: float) -> bool:
         """Whether the bodies of target, goal, tools and objects are slower than `stop_speed`.
 
-        Only the linear speed of the main body counts (1.7); what is static is slow enough.
+        Only the linear speed of the main body counts; what is static is slow enough.
         """
         return all(math.hypot(*body.velocity) < stop_speed for body in self._movers)
 
@@ -276,7 +277,7 @@ def _subgoal(position: Point) -> Thing:
 
 
 def _frame() -> list[Thing]:
-    """Walls at the right, the left and the top edge; the bottom is open (1.2)."""
+    """Walls at the right, the left and the top edge; the bottom is open."""
     return [
         things.bar(
             to_units(position),

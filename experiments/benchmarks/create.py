@@ -20,6 +20,7 @@ import numpy as np
 from absl import flags
 
 from envs_host.create import CreateConfig, CreateEnv
+from envs_host.create.config import Observation
 from envs_host.create.drawing import draw
 from envs_host.create.stage import Stage
 from envs_host.create.tools import all_tools
@@ -28,7 +29,7 @@ from experiments.benchmarks import _measure as m
 LEVELS = flags.DEFINE_list("levels", ["Push", "Obstacle"], "What is played.")
 
 SUBSTEPS = CreateConfig().physics.substeps
-_DRAWN = ("gray", "rgb")
+_DRAWN: tuple[Observation, ...] = ("gray", "rgb")
 _NUM_TOOLS = 10
 _MAX_TRIES = 10_000
 
@@ -92,9 +93,8 @@ def crowded_env(level: str, num_tools: int) -> CreateEnv:
 
 def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
     """Random play of one level with gray, RGB and no observations, and the share of the physics."""
-    envs = {
-        name: CreateEnv(level, config=CreateConfig(observation=name)) for name in (*_DRAWN, "none")
-    }
+    names: tuple[Observation, ...] = (*_DRAWN, "none")
+    envs = {name: CreateEnv(level, config=CreateConfig(observation=name)) for name in names}
     timings = m.measure(
         {name: _subject(env, num_decisions) for name, env in envs.items()}, m.REPEATS.value
     )

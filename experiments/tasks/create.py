@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from envs_host.create.config import CreateConfig, RewardConfig
 from envs_host.create.hosting import CreateHost
 from envs_host.create.levels import load_level
 from envs_host.create.play import NUM_STATES, STATE_SIZE
@@ -279,11 +280,12 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
     """
     spacing = ANALYSIS_SPACING_DEG if is_analysis else DEFAULT_SPACING_DEG
     definition = load_level(level)
-    kwargs = {
-        "level": level,
-        "with_subgoals": with_subgoals,
-        "split": "analysis" if is_analysis else "default",
-    }
+    config = CreateConfig(
+        rewards=RewardConfig(with_subgoals=with_subgoals),
+        split="analysis" if is_analysis else "default",
+        action_ids="universe",
+    )
+    kwargs = {"level": level, "config": asdict(config)}
     suffix = ("" if with_subgoals else "-no-subgoals") + ("-analysis" if is_analysis else "")
     splits = {"default": _analysis} if is_analysis else _SPLITS
     studies = _STUDIES

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from envs_host import _process
-from envs_host._memory import Setup
+from envs_host.memory import Setup
 from envs_host.pool import HostPool, ReplayMismatch, WorkerError
 from tests.envs_host.pool_toys import CHAOTIC, FAULTY, NAME
 

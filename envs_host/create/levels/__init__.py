@@ -1,4 +1,4 @@
-"""The levels of CREATE: twelve tasks, a smoke level, and those of the user (spec create 5)."""
+"""The levels of CREATE: twelve tasks, a smoke level, the user's own (docs/create.md, "Levels")."""
 
 from envs_host.create.levels.registry import (
     TASK_NAMES,

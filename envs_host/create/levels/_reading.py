@@ -6,9 +6,9 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+from envs_host.create.geometry import Point
 from envs_host.create.levels.object_types import Parameter, Value
 
-Point = tuple[float, float]
 _MISSING = object()
 
 

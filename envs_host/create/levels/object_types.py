@@ -1,4 +1,4 @@
-"""The objects that a level may contain, their parameters and defaults (spec create 2.9, 5.3).
+"""The objects that a level may contain, their parameters and defaults.
 
 A *basic* type lists its parameters; one without a default must be given. A *preset* is a basic type
 with other defaults; every parameter can still be given.
@@ -63,7 +63,7 @@ def _tone(default: str) -> Parameter:
 
 
 def _ladder_velocity(speed: float) -> tuple[float, float]:
-    """(4 v cos 95 deg, v sin 95 deg) units/s (spec create 2.6)."""
+    """(4 v cos 95 deg, v sin 95 deg) units/s."""
     return 4.0 * speed * math.cos(math.radians(95.0)), speed * math.sin(math.radians(95.0))
 
 

@@ -1,4 +1,4 @@
-"""What a level file holds, read and checked (spec create 5.0). Numbers only, no expressions.
+"""What a level file holds, read and checked. Numbers only, no expressions.
 
 A file is one JSON object:
 
@@ -29,6 +29,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from envs_host.create.geometry import Point
 from envs_host.create.levels._reading import LevelError, Reader
 from envs_host.create.levels.object_types import ALL_TYPES, Value, resolve
 
@@ -38,8 +39,6 @@ GOAL_KINDS = ("star", "ball", "basket")
 LOOKS = ("target", "basketball")
 REWARD_NAMES = ("goal", "subgoal", "target_hit")
 MARKER_TYPE = "marker_ball"
-
-Point = tuple[float, float]
 
 
 @dataclass(frozen=True)

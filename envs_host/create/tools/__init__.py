@@ -1,4 +1,4 @@
-"""The tools of CREATE: their list, the action universe of them, splits (spec create 3 and 4)."""
+"""The tools of CREATE: their list, their action universe, splits (docs/create.md, "Tools")."""
 
 from envs_host.create.tools.catalogue import (
     CLASS_ORDER,

@@ -1,4 +1,4 @@
-"""Every tool of CREATE: ids, classes and parameters (spec create 3.1)."""
+"""Every tool of CREATE: ids, classes and parameters (docs/create.md, "Tools")."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class Tool:
       angle_deg: orientation, counter-clockwise; aim of cannons and fans.
       size: units: length of bars, planks and belts, radius of balls, side of boxes, circumradius of
         polygons, funnels and buckets.
-      friction: of ramps and planks; a plank's 1.00..1.10 damps what touches it (spec create 2.8).
+      friction: of ramps and planks; a plank's 1.00..1.10 damps what touches it.
       max_angle_deg: how far a see-saw may turn to either side.
       weight_mass: of a weighted see-saw.
       weight_side: "right" or "left", the low end of a weighted see-saw.
@@ -103,7 +103,7 @@ class Tool:
 
     @property
     def primary_parameter(self) -> float:
-        """What the class's tools are told apart by in splits (spec create 4.1).
+        """What the class's tools are told apart by in splits.
 
         The angle, and the maximal angle for see-saws, in degrees. Classes of which the splits say
         nothing: elasticity of balls and boxes, length of levers, velocity of belts; 0 for the
@@ -134,7 +134,7 @@ class Tool:
 
 @lru_cache(maxsize=8)
 def all_tools(angle_spacing: int = DEFAULT_SPACING_DEG) -> tuple[Tool, ...]:
-    """Every tool in the order of ids; the no-op is the last (spec create 3.1).
+    """Every tool in the order of ids; the no-op is the last.
 
     Args:
       angle_spacing: degrees between neighbouring orientations; 15 gives the paper's 2,366 tools, 3
@@ -163,7 +163,7 @@ Row = tuple[ToolClass, dict]
 
 
 def _rows(gap: int) -> Iterator[Row]:
-    """Class and parameters of every tool, in the order of the table in spec create 3.1."""
+    """Class and parameters of every tool, in the order of ids."""
     yield from _grid(ToolClass.RAMP, elasticity=_DULL, angle_deg=_turn(180, gap), size=_BAR_LENGTHS,
                      friction=(1.0,))  # fmt: skip
     yield from _grid(ToolClass.TRAMPOLINE, elasticity=_BOUNCY, angle_deg=_turn(180, gap),

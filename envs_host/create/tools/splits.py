@@ -1,6 +1,6 @@
-"""Which tools are trained with and which are new: published and analysis splits (spec create 4).
+"""Which tools are trained with and which are new (docs/create.md, "Splits" and "Analysis").
 
-The no-op belongs to no part: it is `always_available`, and entry 0 of every action set (8.2).
+The no-op belongs to no part: it is `always_available`, and entry 0 of every action set.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _FIRST_SEESAW_ANGLE_DEG = 5.0
 
 @lru_cache(maxsize=2)
 def published_split(name: str = "default") -> ActionSplit:
-    """A split of the 15-degree tools as published; redrawing it is impossible (spec create 4.2).
+    """A split of the 15-degree tools as published; it cannot be drawn again, as its order is lost.
 
     Args:
       name: "default" (1,097 / 507 / 506 tools; train and evaluation differ by angle within each
@@ -72,7 +72,7 @@ def published_split(name: str = "default") -> ActionSplit:
 
 @lru_cache(maxsize=1)
 def analysis_split() -> ActionSplit:
-    """The 3-degree tools of the analysis (spec create 3.2, 4.4; paper figure 9).
+    """The 3-degree tools of the analysis (paper figure 9).
 
     Train: the 761 tools whose angle is a multiple of 30 degrees (5 + 30 k for see-saws). Test: the
     6,023 tools at least 3 degrees from every training angle, classes pooled: the union of all angle
@@ -91,7 +91,7 @@ def analysis_split() -> ActionSplit:
 
 
 def full_ids() -> np.ndarray:
-    """int32[1737] all tools of the full split; with the no-op, the release's "all" list (4.5)."""
+    """int32[1737] all tools of the full split; with the no-op, the release's "all" list."""
     return published_split("full").ids("all")
 
 
@@ -111,7 +111,7 @@ def analysis_train_ids() -> np.ndarray:
 
 
 def angle_test_ids(min_difference_deg: float, per_class: bool = False) -> np.ndarray:
-    """Analysis tools that are at least so many degrees from what was trained with (4.4).
+    """Analysis tools that are at least so many degrees from what was trained with.
 
     Args:
       min_difference_deg: theta; the paper uses 15, 12, 9, 6 and 3.
@@ -154,9 +154,9 @@ def angle_differences(per_class: bool = False) -> np.ndarray:
 
 
 def embedding_test_ids(table: np.ndarray, min_squared_distance: float) -> np.ndarray:
-    """Analysis tools whose representation is far from every training tool's (4.4).
+    """Analysis tools whose representation is far from every training tool's.
 
-    The release compares the *squared* Euclidean distance with 0.5, 1.0, ..., 5.0 (spec A18).
+    The release compares the *squared* Euclidean distance with 0.5, 1.0, ..., 5.0.
 
     Args:
       table: f32[10877, d] representation of every tool of the 3-degree list.
@@ -195,7 +195,7 @@ def squared_train_distances(table: np.ndarray) -> np.ndarray:
 
 
 def mix_ids(table: np.ndarray, unseen_ratio: float, seed: int) -> np.ndarray:
-    """A pool with about the given share of new tools (4.4; paper figure 9c).
+    """A pool with about the given share of new tools (paper figure 9c).
 
     New are the tools at a squared distance above 3.0, in an order shuffled by `seed`. The first
     share `x` of them is taken, and the first share `1 - x` of the training list, shuffled too.

@@ -1,4 +1,4 @@
-"""The tools as an action universe, with the hand-made vectors (spec create 3.1, 3.3)."""
+"""The tools as an action universe, with the hand-made vectors (docs/create.md, "Tools")."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ NUM_PARAMETERS = 9
 def tool_universe(angle_spacing: int = DEFAULT_SPACING_DEG) -> ActionUniverse:
     """All tools of one angular spacing as an action universe.
 
-    Classes are the 23 of spec create 3.1, the primary parameter is `Tool.primary_parameter`. The
+    Classes are the 23 of `CLASS_ORDER`, the primary parameter is `Tool.primary_parameter`. The
     content is the class label and nine parameters, f64[A, 10]. Engineered vectors:
 
     * `gt32` f32[A, 32]: one-hot class (in the order of `CLASS_ORDER`; the release's order differed
-      from run to run), then nine parameters standardised over the list (spec create 3.3).
+      from run to run), then nine parameters standardised over the list.
 
     Args:
       angle_spacing: whole degrees; 15 (the paper's tools) or 3 (its analysis).
@@ -45,7 +45,7 @@ def tool_universe(angle_spacing: int = DEFAULT_SPACING_DEG) -> ActionUniverse:
 
 
 def _parameters(tool: Tool) -> list[float]:
-    """The nine numbers of spec create 3.3, 0 where the tool has none; angles in radians."""
+    """The nine parameters of the hand-made vector, 0 where the tool has none; angles in radians."""
     numbers = (
         tool.elasticity,
         None if tool.angle_deg is None else np.deg2rad(tool.angle_deg),

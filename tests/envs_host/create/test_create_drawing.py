@@ -1,4 +1,4 @@
-"""What the agent sees, against spec create 7: pixels, tones, order, pictures of our own."""
+"""What the agent sees, against docs/create.md, "Observation": pixels, tones, order, glyphs."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ UNIVERSE = CreateConfig(action_ids="universe")
 NO_OP = {"index": 2365, "position": (0.0, 0.0)}
 CENTRE = (42.0, 42.0)
 
-# Spec create 7.2, "gray seen".
+# Of the release's 8-bit colours.
 GRAY_SEEN = {
     Tone.TARGET: 128.8,
     Tone.MARKER: 168.5,
@@ -72,7 +72,7 @@ def frame_of(tool: Tool, position: tuple[float, float] = CENTRE, size: int = 84)
 
 @pytest.mark.golden
 def test_first_frame_of_push_has_the_histogram_of_the_release() -> None:
-    """Check 24 of spec create 12, with each gray rounded."""
+    """The release's histogram of the first frame, with each gray rounded."""
     frame, _ = CreateEnv("Push", deterministic=True).reset(seed=0)
     assert frame.shape == (84, 84)
     assert frame.dtype == np.uint8
@@ -199,7 +199,7 @@ def test_order_of_a_world() -> None:
     ]
 
 
-# Spec create 7.2, second table: share of the shape's area (with the room that it leaves), mean gray
+# Of the release's pictures: share of the shape's area (with the room that it leaves), mean gray
 # of the ink with its spread. Means over all tools of a class, each of them within the spread.
 PICTURES = {
     ToolClass.TRAMPOLINE: ((0.7, 1.8), 96.0, 35.0),

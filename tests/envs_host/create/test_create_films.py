@@ -1,4 +1,4 @@
-"""Pictures and films for people: mirrored, with colours, traces, text and tint (spec create 10)."""
+"""Pictures and films for people: mirrored, with colours, traces, text and tint."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from envs_host.create.tools import ToolClass, all_tools
 
 BLIND = CreateConfig(observation="none", action_ids="universe")
 NO_OP = {"index": 2365, "position": (0.0, 0.0)}
-# Scores in Push without noise with its ninth action (check 20 of spec create 12).
+# Scores in Push without noise with its ninth action.
 SCRIPT = [{"index": 1755, "position": (0.6, -0.05)}, *[NO_OP] * 11]
 SMALL = RenderOptions(size=64)
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from envs_host.create.building import build_object
+from envs_host.create.config import PhysicsConfig
 from envs_host.create.layout import Layout, draw_layout
 from envs_host.create.levels import (
     TASK_NAMES,
@@ -22,7 +23,6 @@ from envs_host.create.levels import (
     register_level,
 )
 from envs_host.create.levels.object_types import ALL_TYPES, BASIC_TYPES
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.world import World
 
 SMALL = {
@@ -51,7 +51,7 @@ def read(**changes: object) -> object:
 
 
 @pytest.mark.golden
-def test_built_in_levels_are_those_of_the_spec() -> None:
+def test_built_in_levels_have_their_figures() -> None:
     assert set(TASK_NAMES) | {"GoalTest"} <= set(level_names())
     markers = {name for name in TASK_NAMES if load_level(name).has_marker}
     assert markers == {"Push", "Navigate", "Ladder", "Cannon", "Obstacle"}
@@ -120,7 +120,7 @@ def test_ladders_carry_up_and_left_or_down_and_right() -> None:
         spec = read(objects=[{"key": "it", "type": type_name, "pos": [0, 0]}]).objects[0]
         return spec.pair("velocity")
 
-    # (4 v cos 95 deg, v sin 95 deg) with v = 4 (spec create 2.6).
+    # (4 v cos 95 deg, v sin 95 deg) with v = 4.
     assert velocity("ladder") == pytest.approx((-1.394492, 3.984779), abs=1e-6)
     assert velocity("fast_ladder") == velocity("ladder")
     assert velocity("down_ladder") == pytest.approx((1.394492, -3.984779), abs=1e-6)
@@ -238,7 +238,7 @@ def test_members_of_a_group_move_together_and_others_stay() -> None:
     assert still.positions.target == pytest.approx((46.2, 36.12))
 
 
-# Half-widths of spec create 5.2, (x, y), of each level's members that move.
+# Half-widths of the noise, (x, y), of each level's members that move.
 NOISE = {
     "Push": {"marker": (0.2, 0.2), "target": (0.2, 0.2), "goal": (0.2, 0.2)},
     "Navigate": {"target": (0.1, 0.1), "goal": (0.2, 0.2)},

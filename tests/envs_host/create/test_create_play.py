@@ -1,4 +1,4 @@
-"""Recordings of tools against spec create 9."""
+"""Recordings of tools against docs/create.md, "Play"."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def test_velocities_pass_through_the_map_of_positions() -> None:
     state = record_block(0, [2365], 1)[0, 0].astype(np.float64)
     velocity = (state[:, 4:] + 1.0) * 42.0
     positions = (state[:, 2:4] + 1.0) * 42.0
-    # Ten substeps of 1/30 s: g falls by 2/3, and the position moves first (spec create 1.1).
+    # Ten substeps of 1/30 s: g falls by 2/3, and the position moves first.
     np.testing.assert_allclose(np.diff(velocity[:, 1]), -2.0 / 3.0, atol=1e-4)
     np.testing.assert_allclose(np.diff(positions[:, 0]), velocity[:-1, 0] / 3.0, atol=1e-4)
     fallen = velocity[:-1, 1] / 3.0 - 2.0 / 900.0 * 45.0

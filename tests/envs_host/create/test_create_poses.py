@@ -10,7 +10,6 @@ import pytest
 from envs_host.create import poses as create_poses
 from envs_host.create.play import PlayConfig, record_block, record_images, record_worlds
 from envs_host.create.poses import draw_poses, record_poses
-from envs_host.create.recorder import PoolRecorder, Recorder
 from envs_host.create.tools import ToolClass, all_tools, no_op_id
 from jaxnew import collection
 from jaxnew.actions import ActionUniverse
@@ -72,18 +71,6 @@ def test_no_tool_has_more_sprites_than_poses_hold() -> None:
     assert len(create_poses._looks(no_op_id(), 15)) == 1
 
 
-@pytest.mark.contract
-def test_pools_of_any_size_record_the_poses(tmp_path: Path) -> None:
-    ids = IDS[[0, 16, 22, 5, 9]]
-    expected = record_poses(3, ids, 2)
-    for workers in (1, 2):
-        recorder = PoolRecorder(workers, "poses")
-        try:
-            np.testing.assert_array_equal(recorder(3, ids, 2), expected)
-        finally:
-            recorder.close()
-
-
 @pytest.mark.unit
 def test_poses_are_collected_and_gone_on_with(tmp_path: Path) -> None:
     """A collection that was cut off is the one that was not."""
@@ -132,6 +119,3 @@ def test_bad_requests_are_refused() -> None:
         draw_poses(IDS[:1], np.zeros((1, 7, 3, 3)))
     with pytest.raises(ValueError, match=r"2366 is not in 0\.\.2365"):
         record_poses(0, [2366], 1)
-    for make in (Recorder, PoolRecorder):
-        with pytest.raises(ValueError, match=r"modality='video' must be one of \('state', 'poses'"):
-            make(0, 1, "video") if make is Recorder else make(1, "video")

@@ -1,4 +1,4 @@
-"""Check 26 of spec create 12: a random agent fares as the release's did."""
+"""A random agent fares as the release's did."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LARGEST_Z = 4.5
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", TASK_NAMES)
-def test_26_random_agent(name: str) -> None:
+def test_a_random_agent_fares_as_on_the_release(name: str) -> None:
     rows = compare(name, random_episodes(name, 600, seed=1))
     assert {
         row.measure: row.z for row in rows if row.z is not None and abs(row.z) > LARGEST_Z

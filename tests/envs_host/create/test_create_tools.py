@@ -1,4 +1,4 @@
-"""Tools, their universe and their splits against spec create 3 and 4."""
+"""Tools, their universe and their splits against docs/create.md, "Tools" and "Splits"."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from envs_host.create.tools import (
     tool_universe,
 )
 
-# The table of spec create 3.1: class, first id and count at 15 degrees, count at 3 degrees.
+# Class, first id and count at 15 degrees, count at 3 degrees.
 TABLE = [
     ("ramp", 0, 180, 900),
     ("trampoline", 180, 180, 900),
@@ -53,7 +53,7 @@ TABLE = [
     ("no-op", 2365, 1, 1),
 ]
 
-# Group -> training angles (spec create 4.1), by which the default split can be told.
+# Group -> training angles, by which the default split can be told.
 TRAIN_ANGLES = {
     "ramp": {45, 60, 75, 90, 105, 165},
     "trampoline": {45, 60, 75, 90, 105, 165},
@@ -76,7 +76,7 @@ TRAIN_ANGLES = {
 
 @pytest.mark.golden
 @pytest.mark.parametrize(("name", "first", "count", "fine_count"), TABLE)
-def test_18_classes_have_the_ids_and_counts_of_the_table(
+def test_classes_have_the_ids_and_counts_of_the_table(
     name: str, first: int, count: int, fine_count: int
 ) -> None:
     ids = [tool.id for tool in all_tools() if tool.tool_class == name]
@@ -85,7 +85,7 @@ def test_18_classes_have_the_ids_and_counts_of_the_table(
 
 
 @pytest.mark.golden
-def test_18_totals() -> None:
+def test_totals() -> None:
     assert len(all_tools()) == 2366
     assert len(all_tools(3)) == 10877
     assert [tool.id for tool in all_tools()] == list(range(2366))
@@ -185,7 +185,7 @@ def test_hand_made_vectors_are_one_hot_and_standardised() -> None:
     ("name", "counts", "union"),
     [("default", (1097, 507, 506), 2110), ("full", (938, 400, 399), 1737)],
 )
-def test_18_published_splits(name: str, counts: tuple[int, ...], union: int) -> None:
+def test_published_splits(name: str, counts: tuple[int, ...], union: int) -> None:
     split = published_split(name)
     split.check(tool_universe())
     assert (len(split.train), len(split.validation), len(split.test)) == counts

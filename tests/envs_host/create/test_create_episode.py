@@ -1,4 +1,4 @@
-"""Episodes against those recorded from the release, and the rules of spec create 1.6-1.8 and 6."""
+"""Episodes against those recorded from the release, and the rules of docs/create.md."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ import pytest
 import yaml
 
 from envs_host.create import things
-from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.config import CreateConfig, PhysicsConfig, RewardConfig
 from envs_host.create.episode import End, Episode, Outcome
 from envs_host.create.geometry import scaled_distance
 from envs_host.create.layout import Layout
 from envs_host.create.levels import TASK_NAMES, load_level, parse_level
 from envs_host.create.sprites import Kind, Tone
-from envs_host.create.stage import PhysicsConfig
 from envs_host.create.tools import all_tools, no_op_id
 from envs_host.create.world import Placement
 
@@ -83,7 +82,7 @@ def test_rollouts_of_no_ops(name: str) -> None:
 
 
 @pytest.mark.golden
-def test_20_push_with_one_cannon() -> None:
+def test_push_with_one_cannon() -> None:
     golden, episode = GOLDEN["push_script"], start("Push")
     first = golden["first_action"]
     outcomes = [episode.step(TOOLS[first["tool_id"]], tuple(first["pos"]))]
@@ -99,7 +98,7 @@ def test_20_push_with_one_cannon() -> None:
 
 
 @pytest.mark.golden
-def test_21_the_goal_is_credited_once() -> None:
+def test_the_goal_is_credited_once() -> None:
     outcomes = idle(start("GoalTest"))
     assert rewards(outcomes) == pytest.approx(GOLDEN["goal_test"]["rewards"])
     assert outcomes[2].reward == pytest.approx(10.01)
@@ -127,13 +126,13 @@ def test_recorded_episodes(name: str, number: int) -> None:
 
 @pytest.mark.golden
 @pytest.mark.parametrize(("name", "actions"), [("Navigate", 12), ("Belt", 15), ("Obstacle", 43)])
-def test_22_these_end_by_stillness(name: str, actions: int) -> None:
+def test_these_end_by_stillness(name: str, actions: int) -> None:
     outcomes = idle(start(name))
     assert (len(outcomes), outcomes[-1].ends) == (actions, (End.STILL,))
 
 
 @pytest.mark.golden
-def test_19_push_ends_when_the_marker_is_gone() -> None:
+def test_push_ends_when_the_marker_is_gone() -> None:
     episode = start("Push")
     outcomes = idle(episode)
     assert (len(outcomes), episode.summary.reward) == (7, pytest.approx(0.07))
@@ -142,7 +141,7 @@ def test_19_push_ends_when_the_marker_is_gone() -> None:
 
 
 @pytest.mark.golden
-def test_23_blocked_placements_earn_nothing_and_place_nothing() -> None:
+def test_blocked_placements_earn_nothing_and_place_nothing() -> None:
     episode, ramp = start("Push"), TOOLS[72]
     first = episode.step(ramp, (-0.3, 0.5))
     assert (first.placement, first.reward) == (Placement.PLACED, pytest.approx(0.01))
@@ -156,7 +155,7 @@ def test_23_blocked_placements_earn_nothing_and_place_nothing() -> None:
 
 
 @pytest.mark.golden
-def test_23_only_placed_tools_keep_their_distance() -> None:
+def test_only_placed_tools_keep_their_distance() -> None:
     ramp = TOOLS[0]  # Length 6, horizontal: short enough to lie beside another.
     for distance, expected in ((0.299, Placement.BLOCKED), (0.3001, Placement.PLACED)):
         episode = start("Moving")
@@ -213,7 +212,7 @@ def test_a_position_outside_is_invalid_before_clipping() -> None:
 
 
 @pytest.mark.golden
-def test_25_a_caught_ball_keeps_the_episode_running() -> None:
+def test_a_caught_ball_keeps_the_episode_running() -> None:
     episode = start("Buckets")
     outcomes = [episode.step(TOOLS[2248], (0.75, 0.3))]  # Bucket, 0 degrees, radius 9.
     while not outcomes[-1].ends:
@@ -331,7 +330,7 @@ def test_subgoals_are_never_worth_less_than_nothing() -> None:
 
 @pytest.mark.unit
 def test_the_goal_counts_at_the_earliest_after_the_target_hit() -> None:
-    """A touch before the target was hit is credited one action after the hit (6.2)."""
+    """A touch before the target was hit is credited one action after the hit."""
     level = custom(
         kind="marker",
         goal={"kind": "star", "pos": [0.0, 0.1]},
