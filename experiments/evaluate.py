@@ -20,12 +20,23 @@ from jaxnew.task.places import UsageError
 
 ARGUMENTS = Arguments(__doc__, "workers", "set")
 ARGUMENTS.define("string", "run", None, "Run directory of train, or a checkpoint in it.")
-ARGUMENTS.define("enum", "checkpoint", None, "Which checkpoint; default: the one that --run names, or best.", choices=["best", "latest"])
+ARGUMENTS.define(
+    "enum",
+    "checkpoint",
+    None,
+    "Which checkpoint; default: the one that --run names, or best.",
+    choices=["best", "latest"],
+)
 ARGUMENTS.define("list", "sets", ["test"], "Parts of the split: train, validation, test, all.")
 ARGUMENTS.define("integer", "episodes", 5000, "Episodes per set.")
 ARGUMENTS.define("bool", "deterministic", False, "Take the most likely action.")
 ARGUMENTS.define("integer", "set_size", None, "Actions per set; default: as in training.")
-ARGUMENTS.define("integer", "grows_from", 0, "Actions of a set at the first step; the set grows during the episode.")
+ARGUMENTS.define(
+    "integer",
+    "grows_from",
+    0,
+    "Actions of a set at the first step; the set grows during the episode.",
+)
 ARGUMENTS.define("integer", "growth", 1, "Actions that a growing set gains at every step.")
 ARGUMENTS.define("string", "ids", None, "File of action ids to draw sets from.")
 ARGUMENTS.define("string", "table", None, ".npz table whose actions are drawn and represented.")

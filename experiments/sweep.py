@@ -1,6 +1,6 @@
 """Trains many seeds and hyper-parameters as one program, sharded over all devices.
 
-    python -m experiments.sweep --representation=gt12 --seeds=31,41,51,61 \\
+    python -m experiments.sweep --representation=gt12 --seeds=31,41,51,61
         --vary=entropy_coefficient=0.01,0.05 --vary=learning_rate=3e-4,1e-3
 
 Every combination becomes an ordinary run directory, as `train` would have made it.

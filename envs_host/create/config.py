@@ -86,8 +86,8 @@ class RewardConfig:
 
 
 @dataclass(frozen=True)
-class CreateConfig:
-    """All settings of the environment but the level.
+class CreateRules:
+    """What a run may set of the environment: how a level plays.
 
     Attributes:
       physics: see `PhysicsConfig`.
@@ -100,12 +100,6 @@ class CreateConfig:
       directional_target_hit: whether it must go towards the goal's side.
       end_on_goal: whether reaching the goal ends the episode: the paper's text, not its release.
       frame_walls: "level": as the level says; "on" or "off".
-      split, split_part: which tools action sets are drawn from.
-      action_set_size: entries of a set, the no-op included.
-      action_ids: "set": an action's index is a place in this episode's set. "universe": it is a
-        tool's id and no set is drawn (the rollout owns the sets).
-      observation: "gray" uint8[84, 84], "rgb" uint8[84, 84, 3], or "none" (physics only).
-      render_size: pixels of an observation's side.
       task_id: 0 or more: freezes the noise of the level, a layout per id; -1: new noise in every
         episode.
 
@@ -122,33 +116,54 @@ class CreateConfig:
     directional_target_hit: bool = False
     end_on_goal: bool = False
     frame_walls: FrameWalls = "level"
+    task_id: int = -1
+
+    def __post_init__(self) -> None:
+        _check_choice(self, "frame_walls", FrameWalls)
+        for name, low in (
+            ("step_limit", 0),
+            ("stop_speed", 0),
+            ("min_tool_distance", 0),
+            ("task_id", -1),
+        ):
+            _check_range(self, name, low)
+        _check_range(self, "move_threshold", 0, 1)
+
+
+@dataclass(frozen=True)
+class CreateConfig(CreateRules):
+    """All settings of the environment but the level.
+
+    Attributes:
+      split, split_part: which tools action sets are drawn from.
+      action_set_size: entries of a set, the no-op included.
+      action_ids: "set": an action's index is a place in this episode's set. "universe": it is a
+        tool's id and no set is drawn (the rollout owns the sets).
+      observation: "gray" uint8[84, 84], "rgb" uint8[84, 84, 3], or "none" (physics only).
+      render_size: pixels of an observation's side.
+
+    Raises:
+      ValueError: a value is no choice, or out of its range.
+    """
+
     split: Split = "default"
     split_part: SplitPart = "train"
     action_set_size: int = 50
     action_ids: ActionIds = "set"
     observation: Observation = "gray"
     render_size: int = 84
-    task_id: int = -1
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for name, choices in (
-            ("frame_walls", FrameWalls),
             ("split", Split),
             ("split_part", SplitPart),
             ("action_ids", ActionIds),
             ("observation", Observation),
         ):
             _check_choice(self, name, choices)
-        for name, low in (
-            ("step_limit", 0),
-            ("stop_speed", 0),
-            ("min_tool_distance", 0),
-            ("action_set_size", 2),
-            ("render_size", 1),
-            ("task_id", -1),
-        ):
+        for name, low in (("action_set_size", 2), ("render_size", 1)):
             _check_range(self, name, low)
-        _check_range(self, "move_threshold", 0, 1)
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> CreateConfig:

@@ -1,4 +1,4 @@
-"""CREATE's recordings as network inputs, and the HVAEs for them (spec method 3, columns CREATE).
+"""CREATE's recordings as network inputs, and the HVAEs for them (docs/method.md, "HVAE").
 
 A recording is f32[7, 6] states (tool x, y; ball x, y; ball velocity, all in the affine map of
 positions), or uint8[7, 48, 48, 1] frames, which are drawn from f64[7, 4, 3] poses. N_train // B
@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
+from typing import Any
 
 from envs_host.create.poses import FRAMES_SHAPE, POSES_SHAPE, draw_poses
 from envs_host.create.recorder import PoolRecorder
 from jaxnew.observations import RecordingFormat
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import image_modality, vector_modality
-from jaxnew.task import Drawing, Play, StageOneBudget
+from jaxnew.task.budgets import StageOneBudget
+from jaxnew.task.task import Drawing, Play
 
 STATE = vector_modality("state", 6)
 VIDEO = image_modality("video", (48, 48, 1))
@@ -43,30 +45,33 @@ VIDEO_HVAE = RepresentationConfig(
 
 
 def _video_budget(
-    num_recordings: int, hvae: RepresentationConfig, checkpoint_every: int, cost: str
+    num_recordings: int, checkpoint_every: int, cost: str, **model: Any
 ) -> StageOneBudget:
-    # Of images the flat VAE has the HVAE's batches (spec method 4).
-    configs = {"hvae": hvae, "vae": replace(hvae, kind="vae")}
-    chunk_steps = min(20, checkpoint_every)
-    return StageOneBudget(num_recordings, configs, chunk_steps, checkpoint_every, cost)
+    # Of images the flat VAE has the HVAE's batches.
+    hvae = replace(VIDEO_HVAE, **model)
+    vae = replace(hvae, kind="vae")
+    return StageOneBudget(num_recordings, hvae, vae, checkpoint_every, cost)
 
 
 _VIDEO_STAGE_ONE = {
     "smoke": _video_budget(
         2,
-        replace(VIDEO_HVAE, num_steps=2, recordings_per_action=2, actions_per_batch=2),
         1,
         "a minute and a half on one core, half of it for compiling",
+        num_steps=2,
+        recordings_per_action=2,
+        actions_per_batch=2,
     ),
     "laptop": _video_budget(
         24,
-        replace(VIDEO_HVAE, num_steps=2000, recordings_per_action=4, actions_per_batch=16),
         100,
         "about 1.2 hours and 3.5 GB of memory on one core, from the rates of 3 steps and 20 tools",
+        num_steps=2000,
+        recordings_per_action=4,
+        actions_per_batch=16,
     ),
     "paper": replace(
-        _video_budget(1024, VIDEO_HVAE, 500, "nobody measured how long it takes"),
-        counts_epochs=True,
+        _video_budget(1024, 500, "nobody measured how long it takes"), counts_epochs=True
     ),
 }
 

@@ -1,7 +1,7 @@
-"""CREATE: twelve puzzles, what they are made of, what each budget spends (spec create, method).
+"""CREATE: twelve puzzles, what they are made of, what each budget spends (docs/create.md).
 
-`--task=create-push` and its siblings; `create-push-no-subgoals` pays for the goal only (spec create
-6.6), `create-push-analysis` has the tools of the difficulty analysis, 3 degrees apart (4.4).
+`create-push` and its siblings; `create-push-no-subgoals` pays for the goal only,
+`create-push-analysis` has the tools of the difficulty analysis, 3 degrees apart.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from envs_host.create.config import CreateConfig, RewardConfig
+from envs_host.create.config import CreateRules, RewardConfig
 from envs_host.create.hosting import CreateHost
 from envs_host.create.levels import load_level
 from envs_host.create.play import NUM_STATES, STATE_SIZE
@@ -34,24 +34,15 @@ from envs_host.create.tools.splits import (
 )
 from envs_host.pool import HostPool, PoolSettings
 from experiments.tasks._create_stage_one import STATE, STATE_HVAE, video_play
-from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
 from jaxnew.observations import RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
-from jaxnew.representation.learner import Modality, RepresentationConfig
-from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import (
-    ActionStudy,
-    Baselines,
-    Film,
-    HostDomain,
-    LoopConfig,
-    Measured,
-    Play,
-    StageOneBudget,
-    StageTwoBudget,
-    Task,
-)
+from jaxnew.representation.modality import Modality
+from jaxnew.rollout.contract import Episode, RolloutConfig
+from jaxnew.task.budgets import Baselines, LoopConfig, StageOneBudget, StageTwoBudget
+from jaxnew.task.domain import published
+from jaxnew.task.presentation import ActionStudy, Film, Filming, Measured, Presentation
+from jaxnew.task.task import HostDomain, Play, Task
 
 LEVELS = (
     "Push",
@@ -69,106 +60,89 @@ LEVELS = (
 )
 FRAME_SIZE = 84
 _MIX_SEED = 0
-
-# Spec method 6, column CREATE.
-_PPO = PPOConfig(
-    rollout=RolloutConfig(
-        num_envs=32,
-        num_steps=384,
-        set_size=50,
-        normalize_observations=False,
-        normalize_rewards=False,
-    ),
-    microbatch_size=16,  # Images: what one core computes fastest.
-    lr_steps=100_000_000,
-)
-_HYPERPARAMETERS = Hyperparameters(entropy_coefficient=0.005)
-
 _MEASURED = Measured(training={"ours": 470.0}, evaluation=100.0)
 
+_PAPER = StageTwoBudget(
+    num_updates=4882,
+    final_episodes=5000,
+    cost="35 hours on one core, 21 on two, from the rate of `short`",
+    ppo=PPOConfig(
+        rollout=RolloutConfig(num_steps=384, normalize_observations=False, normalize_rewards=False),
+        microbatch_size=16,  # Images: what one core computes fastest.
+        lr_steps=100_000_000,
+    ),
+    hyperparameters=Hyperparameters(entropy_coefficient=0.005),
+    loop=LoopConfig(chunk_updates=1, evaluate_every=50, checkpoint_every=10),
+)
+
 _STAGE_TWO = {
-    "smoke": StageTwoBudget(
+    "smoke": _PAPER.vary(
         num_updates=2,
-        ppo=replace(
-            _PPO,
-            rollout=replace(_PPO.rollout, num_envs=4, num_steps=12, set_size=5),
-            num_epochs=2,
-            num_minibatches=2,
-            microbatch_size=0,
-            lr_steps=1024,
-        ),
-        hyperparameters=_HYPERPARAMETERS,
-        loop=LoopConfig(
-            chunk_updates=1, evaluate_every=1, evaluation_episodes=4, checkpoint_every=1
-        ),
         final_episodes=8,
         cost="seconds",
+        ppo__rollout__num_envs=4,
+        ppo__rollout__num_steps=12,
+        ppo__num_epochs=2,
+        ppo__num_minibatches=2,
+        ppo__microbatch_size=0,
+        ppo__lr_steps=1024,
+        sets__size=5,
+        loop__evaluate_every=1,
+        loop__evaluation_episodes=4,
+        loop__checkpoint_every=1,
     ),
     # 2.15 M steps on the paper's horizon of the learning rate: just past the first point of its
     # curves, which is at 2.14 M (Push, Obstacle).
-    "short": StageTwoBudget(
+    "short": _PAPER.vary(
         num_updates=175,
-        ppo=_PPO,
-        hyperparameters=_HYPERPARAMETERS,
-        loop=LoopConfig(
-            chunk_updates=1, evaluate_every=10, evaluation_episodes=320, checkpoint_every=5
-        ),
-        final_episodes=5000,
         cost="1.3 hours on one core",
+        loop__evaluate_every=10,
+        loop__evaluation_episodes=320,
+        loop__checkpoint_every=5,
     ),
-    "paper": StageTwoBudget(
-        num_updates=4882,
-        ppo=_PPO,
-        hyperparameters=_HYPERPARAMETERS,
-        loop=LoopConfig(chunk_updates=1, evaluate_every=50, checkpoint_every=10),
-        final_episodes=5000,
-        cost="35 hours on one core, 21 on two, from the rate of `short`",
-    ),
+    "paper": _PAPER,
 }
 
-
-def _stage_one(
-    num_recordings: int, hvae: RepresentationConfig, vae_steps: int, cost: str
-) -> StageOneBudget:
-    # The flat VAE draws a multiple of all train actions per step (spec method 4).
-    needed = -(-2048 // hvae.recordings_per_action)
-    vae = replace(
-        hvae,
-        kind="vae",
-        num_steps=vae_steps,
-        actions_per_batch=max(hvae.actions_per_batch, needed),
-    )
-    return StageOneBudget(
-        num_recordings=num_recordings,
-        configs={"hvae": hvae, "vae": vae},
-        chunk_steps=min(20, hvae.num_steps),
-        checkpoint_every=max(20, hvae.num_steps // 20),
-        cost=cost,
-    )
-
-
-_STAGE_ONE = {
-    "smoke": _stage_one(
-        4,
-        replace(STATE_HVAE, num_steps=4, recordings_per_action=2, actions_per_batch=8),
-        4,
-        "half a minute, most of it for recording 2,366 tools",
+# The flat VAE draws a multiple of all train actions per step.
+_STAGE_ONE = StageOneBudget(
+    num_recordings=1024,
+    hvae=STATE_HVAE,
+    vae=replace(STATE_HVAE, kind="vae", num_steps=10_000),
+    checkpoint_every=4000,
+    cost="4 days on two cores, from the rate of `laptop`",
+    counts_epochs=True,
+)
+_STAGE_ONE_BUDGETS = {
+    "smoke": _STAGE_ONE.vary(
+        num_recordings=4,
+        hvae__num_steps=4,
+        hvae__recordings_per_action=2,
+        hvae__actions_per_batch=8,
+        vae__num_steps=4,
+        vae__recordings_per_action=2,
+        vae__actions_per_batch=1024,
+        checkpoint_every=20,
+        cost="half a minute, most of it for recording 2,366 tools",
+        counts_epochs=False,
     ),
-    "laptop": _stage_one(
-        128,
-        replace(STATE_HVAE, num_steps=4000, recordings_per_action=32, actions_per_batch=32),
-        2000,
-        "6 minutes on two cores, one of them for recording",
+    "laptop": _STAGE_ONE.vary(
+        num_recordings=128,
+        hvae__num_steps=4000,
+        hvae__recordings_per_action=32,
+        hvae__actions_per_batch=32,
+        vae__num_steps=2000,
+        vae__recordings_per_action=32,
+        vae__actions_per_batch=64,
+        checkpoint_every=200,
+        cost="6 minutes on two cores, one of them for recording",
+        counts_epochs=False,
     ),
-    "paper": replace(
-        _stage_one(1024, STATE_HVAE, 10_000, "4 days on two cores, from the rate of `laptop`"),
-        counts_epochs=True,
-    ),
+    "paper": _STAGE_ONE,
 }
 
 
 def _positions_only(recordings: Any) -> Any:
-    """The ball's position f32[..., 7, 2], all that the paper's text speaks of (A12)."""
+    """The ball's position f32[..., 7, 2], all that the paper's text speaks of."""
     return recordings[..., 2:4]
 
 
@@ -189,32 +163,28 @@ def _play(spacing_deg: int) -> Play:
 
 
 _SPACINGS = (DEFAULT_SPACING_DEG, ANALYSIS_SPACING_DEG)
-_PLAY = {spacing: _play(spacing) for spacing in _SPACINGS}
-_VIDEO_PLAY = {spacing: video_play(spacing) for spacing in _SPACINGS}
+_PLAYS = {spacing: (_play(spacing), video_play(spacing)) for spacing in _SPACINGS}
 
 
-def _published(name: str, universe: ActionUniverse, seed: int) -> ActionSplit:
-    del universe, seed  # It cannot be drawn anew (spec create 4.2).
-    return published_split(name)
-
-
-def _analysis(universe: ActionUniverse, seed: int) -> ActionSplit:
-    del universe, seed
-    return analysis_split()
+def _host_arguments(level: str, split: str, rules: CreateRules) -> dict[str, Any]:
+    """Arguments of `CreateHost`, as plain values."""
+    return {"level": level, "config": {**asdict(rules), "split": split, "action_ids": "universe"}}
 
 
 def _make_pool(
-    kwargs: dict[str, Any],
+    level: str,
+    split: str,
     *,
     num_envs: int,
     num_halves: int,
     num_workers: int,
     seed: int,
     settings: PoolSettings,
+    environment: CreateRules,
 ) -> HostPool:
     return HostPool(
         "envs_host.create.hosting:CreateHost",
-        kwargs,
+        _host_arguments(level, split, environment),
         num_envs,
         num_workers,
         seed,
@@ -223,15 +193,13 @@ def _make_pool(
     )
 
 
-def _make_film(
-    kwargs: dict[str, Any],
-    seed: np.random.SeedSequence,
-    ids: np.ndarray,
-    positions: np.ndarray,
-    *,
-    size: int,
-) -> Film:
-    return Film(*CreateHost(**kwargs).film(seed, ids, positions, size))
+def _draw(level: str, split: str, environment: CreateRules, episode: Episode, *, size: int) -> Film:
+    """Plays the episode again, from its seed and its actions."""
+    host = CreateHost(**_host_arguments(level, split, environment))
+    ids = np.array(episode.action_ids)
+    positions = np.array([np.asarray(action.position) for action in episode.actions])
+    assert episode.seed is not None
+    return Film(*host.film(episode.seed, ids, positions, size))
 
 
 _STUDIES = {
@@ -240,7 +208,7 @@ _STUDIES = {
         ANALYSIS_ANGLES_DEG,
         lambda table, value: angle_test_ids(value),
         "Tools at least so far from every angle of training tools, all classes pooled and without "
-        "wrap-around (figure 9a, the release's rule; spec create 4.4).",
+        "wrap-around (figure 9a, the release's rule).",
         lambda value: f"ours_analysis[min_angle_deg={value:g}]",
         figure="9a",
     ),
@@ -255,7 +223,7 @@ _STUDIES = {
         ANALYSIS_DISTANCES,
         embedding_test_ids,
         "Tools whose representation is at least so far from that of every training tool (figure "
-        "9b; the release compared squared distances, spec create A18).",
+        "9b; the release compared squared distances).",
         lambda value: f"ours_analysis[min_sq_emb_dist={value:.1f}]",
         figure="9b",
     ),
@@ -280,14 +248,8 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
     """
     spacing = ANALYSIS_SPACING_DEG if is_analysis else DEFAULT_SPACING_DEG
     definition = load_level(level)
-    config = CreateConfig(
-        rewards=RewardConfig(with_subgoals=with_subgoals),
-        split="analysis" if is_analysis else "default",
-        action_ids="universe",
-    )
-    kwargs = {"level": level, "config": asdict(config)}
+    place = (level, "analysis" if is_analysis else "default")
     suffix = ("" if with_subgoals else "-no-subgoals") + ("-analysis" if is_analysis else "")
-    splits = {"default": _analysis} if is_analysis else _SPLITS
     studies = _STUDIES
     if not with_subgoals:  # The paper's analyses had them.
         studies = {name: replace(study, paper_method=None) for name, study in _STUDIES.items()}
@@ -295,34 +257,36 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
     return Task(
         name=f"create-{definition.name.lower()}{suffix}",
         make_universe=partial(tool_universe, spacing),
-        splits=splits,
+        splits={"default": published(analysis_split)} if is_analysis else _SPLITS,
         host=HostDomain(
-            make_pool=partial(_make_pool, kwargs),
+            make_pool=partial(_make_pool, *place),
             action_spec=ActionSpec(tool_universe(spacing).num_actions, position_dim=2),
             observation_spec=ObservationSpec((FRAME_SIZE, FRAME_SIZE), np.uint8, 0, 255),
-            max_episode_steps=definition.step_limit + 1,
+            max_episode_steps=lambda rules: (rules.step_limit or definition.step_limit) + 1,
             stack_size=3,
             pool_settings=PoolSettings(),
-            make_film=partial(_make_film, kwargs),
         ),
-        play=_PLAY[spacing],
-        more_plays=(_VIDEO_PLAY[spacing],),
-        stage_one=_STAGE_ONE,
+        environment=CreateRules(rewards=RewardConfig(with_subgoals=with_subgoals)),
+        plays=_PLAYS[spacing],
+        stage_one=_STAGE_ONE_BUDGETS,
         stage_two=_STAGE_TWO,
-        # Spec create 8.3: of the Full split alone, and only while training.
+        # Of the Full split alone, and only while training.
         validation_groups={} if is_analysis else {"full": attrgetter("class_labels")},
         baselines=Baselines(
             continuous_rollout_share=2 / 3, fixed_set_minibatches=6, finetune_share=1 / 6
         ),
-        measured=_MEASURED,
-        paper_environment=f"CREATE {definition.name}",
-        paper_variant="_".join(variants),
-        studies=studies if is_analysis else {},
+        shown=Presentation(
+            paper_environment=f"CREATE {definition.name}",
+            paper_variant="_".join(variants),
+            measured=_MEASURED,
+            studies=studies if is_analysis else {},
+            filming=Filming(partial(_draw, *place)),
+        ),
         actions_name="create-analysis" if is_analysis else "create",
     )
 
 
-_SPLITS = {name: partial(_published, name) for name in ("default", "full")}
+_SPLITS = {name: published(partial(published_split, name)) for name in ("default", "full")}
 
 
 def _tasks() -> dict[str, Task]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -20,33 +20,45 @@ class StageOneBudget:
 
     Attributes:
       num_recordings: recordings per action to collect.
-      configs: hyper-parameters by kind, `hvae` and `vae`.
-      chunk_steps: gradient steps per compiled call.
+      hvae, vae: hyper-parameters by kind.
       checkpoint_every: gradient steps between checkpoints.
       cost: what it takes; shown before it starts.
       stores_drawn: recordings of a play with a drawing are drawn once and stored; else they are
         drawn for each batch. The numbers are the same.
       counts_epochs: the steps are those of the default split, and encoders that are trained on
-        more or fewer actions take as many passes over them, not as many steps (docs/method.md).
+        more or fewer actions take as many passes over them, not as many steps.
     """
 
     num_recordings: int
-    configs: Mapping[str, RepresentationConfig]
-    chunk_steps: int
+    hvae: RepresentationConfig
+    vae: RepresentationConfig
     checkpoint_every: int
     cost: str
     stores_drawn: bool = False
     counts_epochs: bool = False
 
+    def vary(self, **changes: Any) -> StageOneBudget:
+        """A budget that differs in some fields; `hvae__num_steps` is a field of a group.
+
+        Raises:
+          ConfigError: there is no such field, or it takes no such value.
+        """
+        return config_lib.vary(self, changes)
+
+    @property
+    def chunk_steps(self) -> int:
+        """Gradient steps per compiled call."""
+        return min(20, self.checkpoint_every)
+
     def config(self, kind: str, num_actions: int, num_default: int) -> RepresentationConfig:
         """The hyper-parameters of an encoder.
 
         Args:
-          kind: of `configs`.
+          kind: `hvae` or `vae`.
           num_actions: that it is trained on.
           num_default: that those of the default split are trained on.
         """
-        config = self.configs[kind]
+        config = self.hvae if kind == "hvae" else self.vae
         if not self.counts_epochs:
             return config
         per_pass, usually = (n // config.actions_per_batch for n in (num_actions, num_default))

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from jaxnew.actions import ActionUniverse
-from jaxnew.environment import Action
+from jaxnew.rollout.contract import Episode
 
 
 @dataclass(frozen=True)
@@ -51,75 +51,41 @@ class Film(NamedTuple):
 
     Attributes:
       frames: uint8[height, width, 3] each, all of one size; the last one shows the end.
-      metrics: of the pool's `episode_metrics`, at the end.
+      metrics: of the episode, at the end; where it was played again they must be the same.
     """
 
     frames: list[np.ndarray]
     metrics: Mapping[str, float]
 
 
-class MakeFilm(Protocol):
-    """Plays an episode of a pool again, from its seed and the T actions that it was told.
-
-    Args:
-      seed: of the episode, see `jaxnew.rollout.pool.HostPool`.
-      ids, positions: int32[T] and f32[T, k].
-      size: pixels of the frames' height.
-    """
-
-    def __call__(
-        self, seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, *, size: int
-    ) -> Film: ...
-
-
 class DrawEpisode(Protocol):
-    """Draws an episode of an environment inside jit.
+    """Draws an episode of `Run.play`.
 
     Args:
-      env: where it was played.
-      states: T + 1 states, the start and what `step_env` returned after each action.
-      actions: T actions.
-      rewards: T rewards.
+      environment: where it was played, or on the host its settings (`Task.environment`).
+      episode: its states inside jit; on the host it is played again from its seed and actions.
       size: pixels of the frames' height, about.
-
-    Returns:
-      Frames uint8[height, width, 3], all of one size; the last one shows the end.
     """
 
-    def __call__(
-        self,
-        env: Any,
-        states: Sequence[Any],
-        actions: Sequence[Action],
-        rewards: Sequence[float],
-        *,
-        size: int,
-    ) -> list[np.ndarray]: ...
+    def __call__(self, environment: Any, episode: Episode, *, size: int) -> Film: ...
 
 
 class MakePage(Protocol):
-    """An episode of an environment inside jit as an interactive page.
+    """An episode as an interactive page; returns HTML."""
 
-    Args:
-      env, states, actions: as of `DrawEpisode`.
-
-    Returns:
-      HTML.
-    """
-
-    def __call__(self, env: Any, states: Sequence[Any], actions: Sequence[Action]) -> str: ...
+    def __call__(self, environment: Any, episode: Episode) -> str: ...
 
 
 @dataclass(frozen=True)
 class Filming:
-    """How episodes of an environment inside jit are shown.
+    """How episodes are shown.
 
     Attributes:
       draw: see `DrawEpisode`.
-      make_page: see `MakePage`; None where there is none.
       success_from: an episode whose `Task.selection_metric` is at least this is a success.
       criterion: the same in words, where the metric is not success itself. The sheet of an
         evaluation's last pictures then shows the best and the worst of them.
+      make_page: see `MakePage`; None where there is none.
     """
 
     draw: DrawEpisode

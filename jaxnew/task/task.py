@@ -81,7 +81,7 @@ class HostDomain:
       action_spec: of the actions; there is no stop bit.
       observation_spec: of one observation of the pool. `uint8[height, width]` are frames, which the
         policy sees as stacks; other shapes it sees as they are.
-      max_episode_steps: length of the longest episode.
+      max_episode_steps: settings of the environment, or None -> length of the longest episode.
       stack_size: frames in a stack.
       pool_settings: frozen dataclass, how workers are run; `--set=pool.FIELD=value` changes it.
         None: there is nothing to set.
@@ -93,7 +93,7 @@ class HostDomain:
     make_pool: Callable[..., HostPool]
     action_spec: ActionSpec
     observation_spec: ObservationSpec
-    max_episode_steps: int
+    max_episode_steps: Callable[[Any], int]
     stack_size: int = 1
     pool_settings: Any = None
 
@@ -131,7 +131,7 @@ class HostDomain:
             **({} if self.pool_settings is None else {"settings": self.pool_settings}),
             **({} if environment is None else {"environment": environment}),
         )
-        return HostEnvironments(make, self.max_episode_steps, self.stack_size)
+        return HostEnvironments(make, self.max_episode_steps(environment), self.stack_size)
 
 
 @dataclass(frozen=True)
