@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 
-from envs_mjx.shape_stacking.engines._contract import Engine, Settled, check_state
+from envs_mjx.shape_stacking.engines.contract import Engine, Settled, check_state
 
 __all__ = ["PHYSICS", "Engine", "Settled", "check_state", "make_engine"]
 

@@ -11,10 +11,9 @@ import jax.numpy as jnp
 import mujoco
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines import _mjx_pool, _mjx_private
-from envs_mjx.shape_stacking.engines._contract import Settled, check_state
-from envs_mjx.shape_stacking.engines._limits import is_plausible
-from envs_mjx.shape_stacking.engines._mjx_pool import Limits
+from envs_mjx.shape_stacking.engines import _mjx_private, mjx_pool
+from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 
@@ -118,9 +117,9 @@ class Mjx:
         """One world from a cold start; arrays [num_slots, ...]."""
         step = partial(
             _step,
-            _mjx_pool.with_shapes(self._model, shape_ids),
+            mjx_pool.with_shapes(self._model, shape_ids),
             self._data,
-            _mjx_pool.pool(shape_ids),
+            mjx_pool.pool(shape_ids),
             self._limits,
         )
         start = (qpos.ravel(), qvel.ravel(), jnp.zeros(qvel.size))
@@ -131,11 +130,11 @@ class Mjx:
 _State = tuple[jax.Array, jax.Array, jax.Array]
 
 
-def _step(model: Any, data: Any, pool: _mjx_pool.Pool, limits: Limits, state: _State) -> _State:
+def _step(model: Any, data: Any, pool: mjx_pool.Pool, limits: Limits, state: _State) -> _State:
     """One physics step of qpos, qvel and the last accelerations, flat."""
 
     def find(data: Any) -> _mjx_private.Contacts:
-        return _mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
+        return mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
 
     qpos, qvel, acceleration = state
     data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=acceleration)

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines._contract import Settled, check_state
-from envs_mjx.shape_stacking.engines._limits import is_plausible
-from envs_mjx.shape_stacking.engines._mujoco_pool import Worlds
+from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from jaxnew.cores import available_cores

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 from scipy.spatial.transform import Rotation
 
 from envs_mjx.shape_stacking import shape_library
-from envs_mjx.shape_stacking.engines import _hull_contacts, _mjx_pool
+from envs_mjx.shape_stacking.engines import hull_contacts, mjx_pool
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
 HULL_CLASSES = [k for k, name in enumerate(CLASS_NAMES) if name not in ("sphere", "capsule")]
@@ -35,10 +35,9 @@ class Found(NamedTuple):
 @jax.jit
 def _found(ids: list[jax.Array], centers: list[jax.Array], axes: list[jax.Array]) -> Found:
     one, two = (
-        _mjx_pool._turned(_mjx_pool.pool(i), c, a)
-        for i, c, a in zip(ids, centers, axes, strict=True)
+        mjx_pool._turned(mjx_pool.pool(i), c, a) for i, c, a in zip(ids, centers, axes, strict=True)
     )
-    return Found(*jax.vmap(_hull_contacts.hull_hull)(one, two))
+    return Found(*jax.vmap(hull_contacts.hull_hull)(one, two))
 
 
 def found(pairs: Pairs) -> Found:
@@ -257,7 +256,7 @@ def test_four_corners_of_a_plane_polygon() -> None:
     points = jnp.array([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [0.5, 0.5, 0], [9, 9, 0.0]])
     up, along = jnp.array([0.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 0.0])
     gaps = -0.1 - 0.05 * (points[:, 0] + points[:, 1])
-    choose = jax.jit(_hull_contacts.four_corners)
+    choose = jax.jit(hull_contacts.four_corners)
     for members, expected in (
         ([0, 1, 2, 3, 4], {0, 1, 2, 3}),
         ([0, 1, 4], {0, 1, 4}),

@@ -26,7 +26,7 @@ from envs_mjx.shape_stacking.camera import (
 
 pytestmark = pytest.mark.golden
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 LIBRARY = shape_library()
 NUM_BODIES = 12
 CYLINDER, S = 799, LIBRARY.s[799]
@@ -342,7 +342,12 @@ def mujoco_draws(scenes: list[dict[str, Any]], folder: Path) -> dict[str, np.nda
     reasons = []
     for backend in ("egl", "osmesa"):
         done = subprocess.run(
-            [sys.executable, "-m", "tests.envs_mjx.mujoco_pictures", str(folder / "pictures.npz")],
+            [
+                sys.executable,
+                "-m",
+                "tests.envs_mjx.shape_stacking.mujoco_pictures",
+                str(folder / "pictures.npz"),
+            ],
             input=json.dumps(scenes),
             env={**os.environ, "MUJOCO_GL": backend},
             cwd=ROOT,

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from envs_mjx.shape_stacking import rules, scene, shape_library
-from envs_mjx.shape_stacking.engines import _limits, mujoco_c
-from envs_mjx.shape_stacking.engines._mujoco_pool import world_model
+from envs_mjx.shape_stacking.engines import contract, mujoco_c
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+from envs_mjx.shape_stacking.engines.mujoco_pool import world_model
 from experiments.untrained import towers as stacking
 
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -223,7 +223,7 @@ def test_unsound_worlds_are_given_back(short: MujocoC, where: str, value: float)
 def test_limits_of_plausible_worlds(array: str, column: int, limit: float, sign: float) -> None:
     state = {"qpos": np.zeros((4, 12, 7)), "qvel": np.zeros((4, 12, 6))}
     state[array][:, 11, column] = sign * np.array([0.99 * limit, 1.01 * limit, np.inf, np.nan])
-    assert _limits.is_plausible(**state).tolist() == [True, False, False, False]
+    assert contract.is_plausible(**state).tolist() == [True, False, False, False]
 
 
 @pytest.mark.contract
@@ -239,12 +239,12 @@ def test_worlds_that_explode_are_given_back(
     qpos[:, 0, 2] = 5.0
     qvel[:] = 0.0
     assert engine.settle_host(ids, qpos, qvel)[2].all()
-    monkeypatch.setattr(_limits, "MAX_SPEED", 2.0)  # 2.94 m/s after 0.3 s.
+    monkeypatch.setattr(contract, "MAX_SPEED", 2.0)  # 2.94 m/s after 0.3 s.
     found = engine.settle_host(ids, qpos, qvel)
     assert_same(found, [qpos, qvel, [False, False]])
 
     for name in ("MAX_SPEED", "MAX_SPIN", "MAX_DISTANCE_M"):
-        monkeypatch.setattr(_limits, name, np.inf)
+        monkeypatch.setattr(contract, name, np.inf)
     qvel[1, 0, 2] = 1e12  # MuJoCo stops at 1e10 and starts anew from its own first state.
     found = engine.settle_host(ids, qpos, qvel)
     assert found[2].tolist() == [True, False]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.shape_stacking import scene, shape_library
-from envs_mjx.shape_stacking.engines._mujoco_pool import (
+from envs_mjx.shape_stacking.engines.mujoco_pool import (
     GEOM_KINDS,
     Worlds,
     catalogue_model,

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines._hull_contacts import APART, Hull, four_corners, hull_hull
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
+from envs_mjx.shape_stacking.engines.hull_contacts import APART, Hull, four_corners, hull_hull
 from envs_mjx.shape_stacking.hulls import HullTable
 from envs_mjx.shape_stacking.shapes import shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES

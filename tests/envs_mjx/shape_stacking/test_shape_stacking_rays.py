@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from envs_mjx.shape_stacking.rays import Bodies, Hits, enter, nearest, normals, walk
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from tests.envs_mjx.shape_solids import SOLIDS
+from tests.envs_mjx.shape_stacking.shape_solids import SOLIDS
 
 pytestmark = pytest.mark.oracle
 

@@ -9,7 +9,7 @@ from scipy.spatial import ConvexHull
 from envs_mjx.shape_stacking.hulls import hull_table
 from envs_mjx.shape_stacking.shapes import shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from tests.envs_mjx.shape_solids import SOLIDS
+from tests.envs_mjx.shape_stacking.shape_solids import SOLIDS
 
 pytestmark = pytest.mark.golden
 

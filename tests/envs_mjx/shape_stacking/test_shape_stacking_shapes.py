@@ -10,8 +10,8 @@ from scipy.spatial.transform import Rotation
 from envs_mjx.shape_stacking import shape_library, shape_universe
 from envs_mjx.shape_stacking.shapes import shape_name
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from tests.envs_mjx.mujoco_pictures import faces, pieces, text
-from tests.envs_mjx.shape_solids import SOLIDS
+from tests.envs_mjx.shape_stacking.mujoco_pictures import faces, pieces, text
+from tests.envs_mjx.shape_stacking.shape_solids import SOLIDS
 
 pytestmark = pytest.mark.golden
 

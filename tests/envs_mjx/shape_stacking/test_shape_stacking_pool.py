@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from envs_mjx.shape_stacking import scene, shape_library
-from envs_mjx.shape_stacking.engines import _mjx_pool
-from envs_mjx.shape_stacking.engines._mujoco_pool import catalogue_model
+from envs_mjx.shape_stacking.engines import mjx_pool
+from envs_mjx.shape_stacking.engines.mujoco_pool import catalogue_model
 
 TABLE, FIRST, SECOND, THIRD = 0, 1, 2, 3
 CUBE, SPHERE, SMALL_SPHERE, CAPSULE = 690, 735, 726, 764
@@ -30,9 +30,9 @@ class Found(NamedTuple):
 
 
 @jax.jit
-def _find(ids: jax.Array, centers: jax.Array, axes: jax.Array) -> _mjx_pool.Contacts:
-    pool = _mjx_pool.pool(ids)
-    return _mjx_pool.find_contacts(pool, _mjx_pool.Limits(), centers, axes)
+def _find(ids: jax.Array, centers: jax.Array, axes: jax.Array) -> mjx_pool.Contacts:
+    pool = mjx_pool.pool(ids)
+    return mjx_pool.find_contacts(pool, mjx_pool.Limits(), centers, axes)
 
 
 def contacts(
@@ -146,18 +146,18 @@ def test_boxes_around_bodies_tell_which_pairs_are_near() -> None:
     s, r = S[CUBE], S[CAPSULE]
     ids = jnp.array([CUBE, CAPSULE, SPHERE], jnp.int32)
     centers = jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, s + 2 * r + 0.1], [1.5, 0.3, 0.0]])
-    pool = _mjx_pool.pool(ids)
+    pool = mjx_pool.pool(ids)
     corners = centers[:, None] + pool.vertices
     lengths = jnp.array([0.0, 0.0, 1.0]) * pool.half_length[:, None]
-    gaps = _mjx_pool._gaps(pool, centers, corners, lengths)
+    gaps = mjx_pool._gaps(pool, centers, corners, lengths)
     # Of all three axes the widest: z for the first two, x for the others.
     expected = [0.1, 1.5 - s - S[SPHERE], 1.5 - r - S[SPHERE]]
     np.testing.assert_allclose(gaps, expected, atol=2e-4)
     is_candidate = jnp.array([True, False, True])
-    chosen, is_near = _mjx_pool._nearest(is_candidate, -gaps, 1)
+    chosen, is_near = mjx_pool._nearest(is_candidate, -gaps, 1)
     assert chosen.tolist() == [2]  # The deeper of the two, were these overlaps.
     assert is_near.tolist() == [True]
-    assert not _mjx_pool._nearest(is_candidate, gaps, 2)[1].any()
+    assert not mjx_pool._nearest(is_candidate, gaps, 2)[1].any()
 
 
 @pytest.mark.oracle
@@ -173,7 +173,7 @@ def test_masses_are_those_that_mujoco_compiles() -> None:
 
     ids = jnp.array([form.shape_id for form in scene.forms()[0]], jnp.int32)
     empty = {name: jnp.zeros(values.shape) for name, values in fields.items()}
-    found = _mjx_pool.with_shapes(Model(**empty), ids)
+    found = mjx_pool.with_shapes(Model(**empty), ids)
     assert set(found) == set(fields)
     for name, values in fields.items():
         np.testing.assert_allclose(found[name][1:], values[1:], rtol=1e-4, atol=1e-7)
