@@ -6,6 +6,8 @@ The user browses alone (*organic*), waits for a recommendation (*bandit*) or has
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +23,24 @@ TRANSITIONS = np.array([[0.74, 0.25, 0.01], [0.05, 0.94, 0.01], [0.0, 0.0, 1.0]]
 _DRIFT = 0.1  # Of taste per tick, times |N(0, 1)| (spec recommender 2.2).
 
 
+@dataclass(frozen=True)
+class RecommenderSettings:
+    """What a run may set; the default is the published task.
+
+    Attributes:
+      max_recommendations: recommendations after which an episode is cut, 1 or more.
+
+    Raises:
+      ValueError: the number is out of its range.
+    """
+
+    max_recommendations: int = 100
+
+    def __post_init__(self) -> None:
+        if self.max_recommendations < 1:
+            raise ValueError(f"max_recommendations={self.max_recommendations} must be 1 or more.")
+
+
 @struct.dataclass
 class RecommenderParams:
     """Numbers of the task; all are traced, so none needs a new compilation.
@@ -33,7 +53,7 @@ class RecommenderParams:
 
     product_vectors: jax.Array
     product_constants: jax.Array
-    max_recommendations: jax.Array | int = 100
+    max_recommendations: jax.Array | int = RecommenderSettings.max_recommendations
 
 
 @struct.dataclass
@@ -71,11 +91,21 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
     name = "Recommender-v0"
     episode_metrics = ("click_through_rate", "num_clicks", "episode_length")
 
+    def __init__(self, max_recommendations: int = RecommenderSettings.max_recommendations) -> None:
+        """Takes the fields of `RecommenderSettings`, which become `default_params`.
+
+        Raises:
+          ValueError: a number is out of its range.
+        """
+        self._settings = RecommenderSettings(max_recommendations)
+
     @property
     def default_params(self) -> RecommenderParams:
-        """The published task."""
+        """The published products, and the task as it was set."""
         return RecommenderParams(
-            jnp.asarray(product_vectors()), jnp.asarray(product_constants()), jnp.int32(100)
+            jnp.asarray(product_vectors()),
+            jnp.asarray(product_constants()),
+            jnp.int32(self._settings.max_recommendations),
         )
 
     @property

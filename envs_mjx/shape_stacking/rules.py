@@ -6,6 +6,7 @@ All are for one world and may be vmapped.
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,8 @@ START_CYLINDERS = (798, 799, 800)
 START_CENTER = (-0.2, 0.2)
 START_GAP = (1.0, 1.6)
 
-REWARD_VARIANTS = ("release", "paper")
+RewardVariant = Literal["release", "paper"]
+REWARD_VARIANTS = get_args(RewardVariant)
 
 # A body is dropped so that its bounding sphere overlaps the one below by this much of its scale.
 _OVERLAP = 0.1

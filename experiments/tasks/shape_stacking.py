@@ -6,11 +6,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
-from typing import Literal
 
-from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
+from envs_mjx.shape_stacking import (
+    ShapeStacking,
+    StackingSettings,
+    published_split,
+    shape_universe,
+)
 from envs_mjx.shape_stacking.films import draw_episode, episode_page
 from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block
 from jaxnew.actions import ActionSplit, ActionUniverse
@@ -29,16 +33,6 @@ from jaxnew.task import (
     StageTwoBudget,
     Task,
 )
-
-
-@dataclass(frozen=True)
-class StackingSettings:
-    """What can be set with `--set=environment.FIELD=value`; see `ShapeStacking`."""
-
-    physics: Literal["auto", "mjx", "mujoco"] = "auto"
-    reward_variant: Literal["release", "paper"] = "release"
-    has_shadows: bool = False
-
 
 # Spec method 3, column Stacking: 60,000 steps on 32 shapes with 52 of 1,024 pictures each.
 _HVAE = RepresentationConfig(

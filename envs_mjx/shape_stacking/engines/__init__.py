@@ -7,15 +7,16 @@ import.
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 
 from envs_mjx.shape_stacking.engines.contract import Engine, Settled, check_state
 
-__all__ = ["PHYSICS", "Engine", "Settled", "check_state", "make_engine"]
+__all__ = ["PHYSICS", "Engine", "Physics", "Settled", "check_state", "make_engine"]
 
-PHYSICS = ("auto", "mjx", "mujoco")
+Physics = Literal["auto", "mjx", "mujoco"]
+PHYSICS = get_args(Physics)
 
 
 @lru_cache(maxsize=4)
