@@ -1,4 +1,4 @@
-"""Grid World: navigation with five-move skills past a lava river (spec grid_world)."""
+"""Grid World: navigation with five-move skills past a lava river (docs/grid_world.md)."""
 
 from envs_mjx.grid_world.environment import (
     GridWorld,

@@ -1,4 +1,4 @@
-"""Grid World: cross a lava river to the goal with five-move skills (spec grid_world)."""
+"""Grid World: cross a lava river to the goal with five-move skills (docs/grid_world.md)."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ class GridWorldState:
 
 
 def decode_layout(layout: Array) -> tuple[Array, Array, Array]:
-    """What a layout id means (spec grid_world 1.1).
+    """What a layout id means (docs/grid_world.md, "Layouts").
 
     Args:
       layout: integer[...] in 0..41, Python, NumPy or JAX.
@@ -130,13 +130,13 @@ def encode_layout(is_horizontal: bool, position: int, opening: int) -> int:
 
 
 def is_wall() -> np.ndarray:
-    """bool[9, 9] the outer ring, indexed [x, y]; the same in every layout. Spec grid_world 1."""
+    """bool[9, 9] the outer ring, indexed [x, y]; the same in every layout."""
     x, y = np.ogrid[:GRID_SIZE, :GRID_SIZE]
     return (np.minimum(x, y) < FIRST_CELL) | (np.maximum(x, y) > LAST_CELL)
 
 
 class GridWorld(Environment[GridWorldState, GridWorldParams]):
-    """A 9 x 9 grid with a lava river between start and goal (spec grid_world, `GridWorld-v0`).
+    """A 9 x 9 grid with a lava river between start and goal.
 
     Observation: f32[81], the object id of cell (x, y) in element `9 * x + y`, each in 1..11: 1
       empty, 2 wall, 8 goal, 9 lava, 10 agent (hides what is below it), 11 opening (sub-goal). The
@@ -262,7 +262,7 @@ def _first_state(key: jax.Array, params: GridWorldParams) -> GridWorldState:
 
 
 def _observe(state: GridWorldState) -> jax.Array:
-    """f32[81] object ids with the agent on top (spec grid_world 4).
+    """f32[81] object ids with the agent on top.
 
     Compares each cell with the few numbers that make a layout: measured faster than a gather from
     a bank of the 42 layouts.
@@ -287,7 +287,7 @@ def _observe(state: GridWorldState) -> jax.Array:
 def _transition(
     state: GridWorldState, action: Action, params: GridWorldParams
 ) -> tuple[GridWorldState, jax.Array, jax.Array, jax.Array, Info]:
-    """One skill, move by move (spec grid_world 3): (state, reward, terminated, truncated, info)."""
+    """One skill, move by move: (state, reward, terminated, truncated, info)."""
     chex.assert_shape(state.agent_xy, (2,))
     chex.assert_rank(action.id, 0)
     is_valid = (action.id >= 0) & (action.id < NUM_SKILLS)

@@ -1,4 +1,4 @@
-"""Recommender: 10,000 products for users whose taste drifts (spec recommender)."""
+"""Recommender: 10,000 products for users whose taste drifts (docs/recommender.md)."""
 
 from envs_mjx.recommender.environment import (
     Recommender,

@@ -1,4 +1,4 @@
-"""Shape Stacking: towers of shapes on a table (spec shape_stacking)."""
+"""Shape Stacking: towers of shapes on a table (docs/shape_stacking.md)."""
 
 from envs_mjx.shape_stacking.environment import (
     ShapeStacking,

@@ -1,4 +1,7 @@
-"""Pictures of towers, by casting rays inside jit (spec shape_stacking 6, 7 and 11.4)."""
+"""Pictures of towers, by casting rays inside jit.
+
+See docs/shape_stacking.md, "Camera", "Light" and "Play data".
+"""
 
 from __future__ import annotations
 
@@ -48,7 +51,7 @@ class Camera:
 
 
 def task_camera(position_dim: int = 1) -> Camera:
-    """The camera of the stacking task (spec 6.1).
+    """The camera of the stacking task.
 
     The original renders upside down and never turns its rows over, so that the picture is upright
     but mirrored: columns grow with x although the camera looks along -y.
@@ -71,7 +74,7 @@ def task_camera(position_dim: int = 1) -> Camera:
 
 
 def orbit_camera(azimuth: jax.Array, height: jax.Array, distance: float = 2.0) -> Camera:
-    """A camera that looks at the origin, upright and not mirrored (spec 7).
+    """A camera that looks at the origin, upright and not mirrored.
 
     Args:
       azimuth: f32[] rad, from +x towards +y.
@@ -92,7 +95,7 @@ def render(
     *,
     has_shadows: bool = True,
 ) -> jax.Array:
-    """The observation of the task: shapes on their table (spec 6).
+    """The observation of the task: shapes on their table.
 
     The original casts shadows. Without them a picture costs a third and means rise by about 2 %.
 
@@ -170,7 +173,7 @@ def render_rgb(
 def _light(
     bodies: Bodies, hits: Hits, points: Vector, camera: Camera, has_shadows: bool
 ) -> jax.Array:
-    """f32[P] how bright surfaces are, relative to their colour (spec 6.2)."""
+    """f32[P] how bright surfaces are, relative to their colour."""
     normal = normals(bodies, hits, points)
     light = _AMBIENT + jnp.where(hits.surface < 0, 0.0, _EMISSION)
     light += _HEADLIGHT * jnp.maximum(-dot(normal, camera.forward), 0.0)

@@ -1,6 +1,7 @@
-"""The Shape Stacking task: a tower on two cylinders, from shapes let go one by one (spec 3 to 6).
+"""The Shape Stacking task: a tower on two cylinders, from shapes let go one by one.
 
-The observation is what a camera sees after every settling, the last four pictures of it.
+The observation is what a camera sees after every settling, the last four pictures of it. Rules:
+docs/shape_stacking.md.
 """
 
 from __future__ import annotations
@@ -90,7 +91,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     Reward: `rules.tower_reward` at the end of an episode, else 0.
     Ends: `terminated` by a stop, or where the simulation left the finite or plausible numbers, with
       reward 0 then; `truncated` after `max_actions`.
-    Starts: two equal cylinders at rest (spec 3), drawn anew.
+    Starts: two equal cylinders at rest, drawn anew.
     Parameters: `StackingParams`.
     Info: `final_height` f32[] height of the highest origin above the table, m; `max_height` f32[]
       the same, largest of the episode so far; `num_placed`, `num_repeats`, `episode_length` int32[]
@@ -166,7 +167,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         return StackingSettings(max_actions=int(params.max_actions)).max_actions
 
     def reset_env(self, key: jax.Array, params: StackingParams) -> tuple[jax.Array, StackingState]:
-        """Two cylinders at rest (spec 3); consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
+        """Two cylinders at rest; consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
         del params
         key_cylinder, key_center, key_gap = jax.random.split(key, 3)
         cylinder = jax.random.choice(key_cylinder, jnp.array(rules.START_CYLINDERS, jnp.int32))
@@ -188,7 +189,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     def step_env(
         self, key: jax.Array, state: StackingState, action: Action, params: StackingParams
     ) -> Transition:
-        """One action and 3 s, without auto-reset (spec 4).
+        """One action and 3 s, without auto-reset.
 
         Args:
           key: not used; nothing is random.

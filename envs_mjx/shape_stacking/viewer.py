@@ -1,4 +1,4 @@
-"""An interactive page of a tower: Brax's viewer with the shapes of the library (spec 2).
+"""An interactive page of a tower: Brax's viewer with the shapes of the library.
 
 Lengths are metres. Imports Brax, by its adapter.
 """
@@ -16,7 +16,7 @@ from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, shape_library
 from envs_mjx.shape_stacking.solids import ARCH_OPENING_RADIUS, CLASS_NAMES, solids
 
-# The table as it is drawn (spec 1): half-sizes along x and y.
+# The table as it is drawn: half-sizes along x and y.
 TABLE_HALF_SIZES = (4.0, 2.0)
 TABLE_COLOR = (0.9, 0.9, 0.9)
 
@@ -87,7 +87,7 @@ def body_geom(shape_id: int) -> Geom:
         "pos": [0.0, 0.0, 0.0],
         "rot": [1.0, 0.0, 0.0, 0.0],
         "rgba": [*color.tolist(), 1.0],
-        # Radius 1 and half-length 1 at s = 1 (spec 2.2).
+        # Radius 1 and half-length 1 at s = 1.
         "size": [form.s, 0.0 if form.kind == "sphere" else form.s, 0.0],
     }
     if form.kind == "mesh":
@@ -152,7 +152,7 @@ def _polygons(class_label: int) -> list[np.ndarray]:
 
 
 def _arch() -> list[np.ndarray]:
-    """The box (2, 1, 1) with its opening (spec 2.2), cut into columns along x.
+    """The box (2, 1, 1) with its opening, cut into columns along x.
 
     The opening is drawn with 32 chords, which make it 0.2 % smaller.
     """

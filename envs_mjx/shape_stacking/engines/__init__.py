@@ -1,7 +1,7 @@
-"""Engines: what happens to the bodies in the 3 s after an action (spec shape_stacking 4, item 4).
+"""Engines: what happens to the bodies in the 3 s after an action.
 
 `make_engine` makes one by its name. Each is a module of its own, since simulators take long to
-import.
+import. See docs/shape_stacking.md, "Engines".
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""MJX's JAX backend: inside the program, on any device; shapes are data (spec 11.2)."""
+"""MJX's JAX backend: inside the program, on any device; shapes are data."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 
 # Line searches always take all their steps here. With 8 and 12 towers end no nearer to C's; with 2
-# and 3 a cube that tips off an edge ends 5 cm from where it should (spec 13, check 14):
-# results/shape_stacking/mjx_speed.md.
+# and 3 a cube that tips off an edge ends 5 cm from where it should (docs/shape_stacking.md,
+# "Reference figures", 14): results/shape_stacking/mjx_speed.md.
 SOLVER = scene.Solver(iterations=3, ls_iterations=5)
 MAX_CONTACTS = 48
 
@@ -55,7 +55,7 @@ class Mjx:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's (spec 4).
+          settle_steps: at least 1; 300 is the task's.
           num_slots: 2 to 12. Arrays have 12 rows whatever it is; with fewer slots, which is
             cheaper, worlds that use a body beyond them are not `ok`.
           max_contacts: points of contact in a world, at least 1; the deepest are kept.

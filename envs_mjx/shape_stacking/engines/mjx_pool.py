@@ -133,7 +133,7 @@ def with_shapes(model: Any, shape_ids: jax.Array) -> Any:
     """`mjx.Model` whose bodies have the masses of these shapes, int32[n]; any for unused slots."""
     table = {name: jnp.asarray(value) for name, value in _constants().items()}
     mass, inertia = table["mass"][shape_ids], table["inertia"][shape_ids]
-    # The inverse of what a contact has to move, which softness is relative to (spec 11.2, item 5).
+    # The inverse of what a contact has to move, which softness is relative to.
     inverse = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=-1)], axis=-1)
     values = {
         "body_mass": mass,

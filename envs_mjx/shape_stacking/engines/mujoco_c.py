@@ -29,8 +29,8 @@ class MujocoC:
 
     Spheres, capsules and cylinders collide as such, all other shapes by the hulls of the library
     (`solids.Solid.hull`). Two hulls touch in one point, as in the engine of the paper's runs, whose
-    towers creep for that (spec 10): the figures of spec 13 are those of one point. On the table a
-    hull stands on up to four in either case.
+    towers creep for that: docs/shape_stacking.md, "Reference figures", are those of one point. On
+    the table a hull stands on up to four in either case.
 
     Numbers are f64 inside. On one machine a world's result is the same bits for every batch size,
     order of worlds and number of threads.
@@ -51,7 +51,7 @@ class MujocoC:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's (spec 4).
+          settle_steps: at least 1; 300 is the task's.
           num_threads: 0 for one per core that this process may use.
           has_multiple_contacts: two hulls touch in several points where their faces or edges lie
             on each other, as in MuJoCo's present defaults and much as in MJX: steadier towers.

@@ -3,7 +3,7 @@
 A compiled model cannot give a geom another type, so a body of the pool holds four geoms: sphere,
 capsule, cylinder and mesh. In each world at most one of the four collides; the others have their
 collision bits off. All hulls of the library are assets of the one model, and a world's mesh geom
-points at the hull that it needs (spec engines 3b).
+points at the hull that it needs.
 """
 
 from __future__ import annotations

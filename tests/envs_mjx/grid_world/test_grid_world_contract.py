@@ -1,4 +1,4 @@
-"""Grid World keeps the promises of style 34, and those of its own documentation."""
+"""Grid World keeps the promises of every environment, and those of its own documentation."""
 
 from __future__ import annotations
 

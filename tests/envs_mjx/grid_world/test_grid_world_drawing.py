@@ -98,7 +98,7 @@ def test_skill_path_stops_where_the_episode_did() -> None:
 
 
 def test_episode_becomes_a_gif(tmp_path: Path) -> None:
-    """V4/4, skills 21, 320, 1012 (spec check 3): a start and twelve moves."""
+    """V4/4, skills 21, 320, 1012: a start and twelve moves."""
     env = GridWorld()
     params = env.default_params.replace(fixed_layout=10)
     step_env = jax.jit(env.step_env)

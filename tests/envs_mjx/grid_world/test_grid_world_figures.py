@@ -1,6 +1,6 @@
-"""The behavioural checks of spec grid_world 9, by their numbers there.
+"""The reference figures of docs/grid_world.md, by their numbers there.
 
-Layouts are written as in the spec: "V4/4" is a vertical river at x = 4 with its opening at y = 4.
+Layouts are written as there: "V4/4" is a vertical river at x = 4 with its opening at y = 4.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def test_01_layouts_are_uniform_and_well_formed() -> None:
     observations, states = jax.jit(jax.vmap(ENV.reset, (0, None)))(keys, ENV.default_params)
     counts = np.bincount(states.layout, minlength=42)
     assert len(counts) == 42
-    assert np.abs(counts - 1000).max() <= 150  # the spec's bound, 4.8 standard deviations
+    assert np.abs(counts - 1000).max() <= 150  # the page's bound, 4.8 standard deviations
     is_lava = np.asarray(observations).reshape(-1, 9, 9) == 9
     assert (is_lava.sum(axis=(1, 2)) == 6).all()
     rows_hit, columns_hit = is_lava.sum(axis=1).max(axis=1), is_lava.sum(axis=2).max(axis=1)
@@ -266,12 +266,12 @@ def test_16_random_policy() -> None:
 
     is_dead, last = jax.tree.map(np.asarray, run(jax.random.key(16)))
     assert last["done"].all()
-    # Tolerances are the spec's.
+    # Tolerances are the page's.
     assert abs(last["is_success"].mean() - 0.0027) <= 0.0006
     assert abs(is_dead.mean() - 0.857) <= 0.006
     assert abs(last["has_reached_subgoal"].mean() - 0.126) <= 0.006
     assert abs(last["episode_return"].mean() - 0.0136) <= 0.001
-    # Spec 6 prints 22.7, that is +-0.05; 40,000 lengths of deviation 16 have a standard error of
+    # The page has 22.7, that is +-0.05; 40,000 lengths of deviation 16 have a standard error of
     # 0.08, theirs the same: 0.05 + 4 * 0.08 * sqrt(2).
     assert abs(last["episode_length"].mean() - 22.7) <= 0.5
 
@@ -309,7 +309,7 @@ def test_18_split_sizes_hash_and_content() -> None:
 
 
 def test_layout_ids_decode_as_recommended() -> None:
-    """Spec 1.1: orientation id // 21, position 3 + (id // 7) % 3, opening 1 + id % 7."""
+    """Orientation id // 21, position 3 + (id // 7) % 3, opening 1 + id % 7."""
     ids = [encode_layout(h, p, o) for h in (False, True) for p in (3, 4, 5) for o in range(1, 8)]
     assert ids == list(range(42))
     decoded = zip(*decode_layout(np.arange(42)), strict=True)

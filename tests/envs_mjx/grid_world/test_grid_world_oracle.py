@@ -1,4 +1,4 @@
-"""The whole transition table against plain NumPy, written from the spec's text alone.
+"""The whole transition table against plain NumPy, by the text of docs/grid_world.md.
 
 Swept are all states in which a skill can begin: 42 layouts x the 42 interior cells that are
 neither lava nor goal (39 walls and lava cells of the 81 cannot be stood on between skills, the goal
@@ -22,7 +22,7 @@ ENV = GridWorld()
 
 
 def oracle_grids() -> np.ndarray:
-    """int8[42, 9, 9] ids [layout, x, y], by the sentences of spec 1 and 1.1."""
+    """int8[42, 9, 9] ids [layout, x, y], by the sentences of "World" and "Layouts"."""
     grids = np.ones((42, 9, 9), np.int8)
     grids[:, [0, 8], :] = 2
     grids[:, :, [0, 8]] = 2
@@ -44,7 +44,7 @@ def oracle_skill(
     visited: np.ndarray,
     skill: np.ndarray,
 ) -> dict[str, np.ndarray]:
-    """One skill by the six rules of spec 3, for flat arrays of states, in float64."""
+    """One skill by the six rules of "A step", for flat arrays of states, in float64."""
     x, y, num_moves, visited = x.copy(), y.copy(), num_moves.copy(), visited.copy()
     reward = np.zeros(len(x))
     ended, success = np.zeros(len(x), bool), np.zeros(len(x), bool)
@@ -156,7 +156,7 @@ def test_states_near_the_time_limit() -> None:
 
 
 def test_observations_of_every_state() -> None:
-    """81 ids in x-major order, the agent on top, for each layout and interior cell (spec 4)."""
+    """81 ids in x-major order, the agent on top, for each layout and interior cell."""
     grids = oracle_grids()
     layout, x, y = np.nonzero(grids != 2)
     expected = grids[layout].copy()

@@ -1,4 +1,4 @@
-"""The play environment against a NumPy walk (spec grid_world 5)."""
+"""The play environment against a NumPy walk (docs/grid_world.md, "Play data")."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def stored() -> np.ndarray:
 
 
 def walk(starts: np.ndarray, skill_id: np.ndarray, low: int, high: int) -> np.ndarray:
-    """int[..., 6, 2] by the sentences of spec 5: a wall stops the move, the next goes on."""
+    """int[..., 6, 2] by the sentences of the page: a wall stops the move, the next goes on."""
     cells = [starts.astype(int)]
     for t in range(5):
         move = (skill_id // 4**t) % 4

@@ -1,4 +1,4 @@
-"""Skills and their universe (spec grid_world 2 and 5.1)."""
+"""Skills and their universe (docs/grid_world.md, "Skills")."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def test_moves_of_numpy_and_jax() -> None:
     assert from_numpy.shape == (32, 32, 5)
     assert from_numpy.dtype == from_jax.dtype == np.int32
     assert np.array_equal(from_numpy, from_jax)
-    # Base 4, first move least significant (spec 2).
+    # Base 4, first move least significant.
     assert np.array_equal((from_numpy * 4 ** np.arange(5)).sum(-1), ids)
 
 
@@ -67,7 +67,7 @@ def test_displacements() -> None:
 def test_quadrants_hold_256_skills_and_point_where_they_say() -> None:
     universe = skill_universe()
     assert np.bincount(universe.class_labels).tolist() == [256] * 4
-    # y grows downwards: the release's figures swap two of these glyphs (spec method 11).
+    # y grows downwards: the release's figures swap two of these glyphs.
     for corner, name in [
         ((2, 1), "south-east"),
         ((-2, 1), "south-west"),

@@ -1,6 +1,6 @@
-"""The behavioural checks of spec recommender 9, by their numbers there, and its golden figures.
+"""The reference figures of docs/recommender.md, by their numbers there, and its tables.
 
-The reference policies of spec 6 play sets that are drawn from all 10,000 products. Their published
+The policies of "Anchors" play sets that are drawn from all 10,000 products. Their published
 figures come from 4,000 episodes each, so a tolerance covers both sampling errors.
 """
 
@@ -24,12 +24,12 @@ pytestmark = [pytest.mark.golden, pytest.mark.optimized]
 ENV = Recommender()
 PARAMS = ENV.default_params
 BATCH = 4000  # Episodes played at once.
-# Those whose checks state a tolerance; it needs so many.
+# Those whose figures state a tolerance; it needs so many.
 NUM_BATCHES = {("random", 50): 3, ("dot", 50): 2, ("oracle", 50): 4}
 NUM_FORCED = 10_000  # Users of `forced_step`.
 SET_SIZES = (25, 50, 500)
 WEIGHTS = {"random": (0, 0), "dot": (1, 0), "mu": (0, 1), "oracle": (1, 1)}  # Of beta.omega, mu.
-# Spec 6: CTR, clicks per episode, length, share of episodes that reach 100, browsing ticks.
+# "Anchors": CTR, clicks per episode, length, share of episodes that reach 100, browsing ticks.
 REFERENCES = {
     ("random", 50): (0.156, 7.4, 48.7, 0.20, 40),
     ("random", 500): (0.159, 7.3, 48.3, 0.19, 40),
@@ -40,7 +40,7 @@ REFERENCES = {
     ("oracle", 50): (0.573, 19.3, 34.1, 0.07, 81),
     ("oracle", 500): (0.662, 20.9, 31.7, 0.05, 86),
 }
-# Spec 3.1.
+# "Click probability".
 CLICK_PROBABILITIES = {
     -20: 0.013075, -10: 0.014970, -8: 0.016778, -6: 0.020490, -5: 0.023748, -3: 0.036302,
     -2: 0.048284, -1: 0.067214, 0: 0.096667, 1: 0.140492, 2: 0.200759, 3: 0.275115,
@@ -162,7 +162,7 @@ def assert_mean(values: np.ndarray, expected: float, tolerance: float) -> None:
 
 
 def test_01_golden_products() -> None:
-    """The constants of spec 1; the draw is repeated here, since raw vectors are not kept."""
+    """The constants of "Products"; the draw is repeated here, since raw vectors are not kept."""
     rng = np.random.RandomState(123)
     raw, constants = rng.normal(size=(10_000, 16)), rng.normal(0, 3, size=10_000)
     norms = np.linalg.norm(raw, axis=1)
@@ -224,7 +224,7 @@ def test_05_transition_table() -> None:
     for mode, tolerance in [(BANDIT, 0.001), (ORGANIC, 0.0018), (STOP, 0)]:
         modes = ticks(jax.random.split(jax.random.key(mode), num_ticks), mode)
         shares = np.bincount(modes, minlength=3) / num_ticks
-        # The spec's bound, 4.2 standard errors; from organic, four of them.
+        # The page's bound, 4.2 standard errors; from organic, four of them.
         np.testing.assert_allclose(shares, table[mode], atol=tolerance, rtol=0)
 
 
@@ -303,7 +303,7 @@ def test_11_random_policy(play) -> None:
 
 
 def test_12_best_policies(play) -> None:
-    # For sets of 500 the spec gives no tolerance: four standard errors.
+    # For sets of 500 the page gives no tolerance: four standard errors.
     for policy, size, rate, tolerance in [
         ("oracle", 50, 0.573, 0.01),
         ("dot", 50, 0.271, 0.01),
@@ -316,7 +316,7 @@ def test_12_best_policies(play) -> None:
 
 @pytest.mark.parametrize(("policy", "size"), REFERENCES)
 def test_reference_policies(play, policy: str, size: int) -> None:
-    """Spec 6. A tick adds 0.16 to E|omega|^2 whatever the policy does, which counts browsing."""
+    """A tick adds 0.16 to E|omega|^2 whatever the policy does, which counts browsing."""
     played = play(policy, size)
     length = played["episode_length"]
     browsing = (played["square"] - 16) / 0.16 - length
@@ -325,7 +325,7 @@ def test_reference_policies(play, policy: str, size: int) -> None:
     for values, expected, half_unit in zip(
         columns, REFERENCES[policy, size], half_units, strict=True
     ):
-        # Four standard errors of the difference from the spec's 4,000 episodes.
+        # Four standard errors of the difference from the page's 4,000 episodes.
         tolerance = half_unit + 4 * np.std(values) * np.sqrt(1 / 4000 + 1 / len(values))
         assert abs(np.mean(values) - expected) <= tolerance, (np.mean(values), expected)
 

@@ -1,4 +1,4 @@
-"""The Recommender against plain NumPy that plays every tick, written from the spec's text alone.
+"""The Recommender against plain NumPy that plays every tick by the text of docs/recommender.md.
 
 What a state and a product decide is compared number by number; what is drawn is compared as
 distributions. The keys are fixed, and a sound environment fails one comparison in a thousand.
@@ -27,7 +27,7 @@ ORGANIC, BANDIT, STOP = 0, 1, 2
 
 
 def oracle_products() -> tuple[np.ndarray, np.ndarray]:
-    """(beta [10000, 16], mu [10000]) by spec 1, in float64."""
+    """(beta [10000, 16], mu [10000]) by "Products", in float64."""
     rng = np.random.RandomState(123)
     raw = rng.normal(size=(10_000, 16))
     return raw / np.sqrt((raw**2).sum(axis=1))[:, None], rng.normal(0, 3, size=10_000)
@@ -37,7 +37,7 @@ BETA, MU = oracle_products()
 
 
 def oracle_probability(x: np.ndarray) -> np.ndarray:
-    """Of a click, by the formula of spec 3.1."""
+    """Of a click, by the formula of "Click probability"."""
 
     def sig(u: np.ndarray) -> np.ndarray:
         return 1 / (1 + np.exp(-u))
@@ -46,7 +46,7 @@ def oracle_probability(x: np.ndarray) -> np.ndarray:
 
 
 def oracle_tick(rng: np.random.Generator, omega: np.ndarray, mode: int) -> tuple[np.ndarray, int]:
-    """Spec 2.2: a new mode, and omega always moves, by one |n| for all coordinates."""
+    """A new mode, and omega always moves, by one |n| for all coordinates."""
     u = rng.random()
     if mode == ORGANIC:
         mode = ORGANIC if u < 0.74 else BANDIT if u < 0.99 else STOP
@@ -57,7 +57,7 @@ def oracle_tick(rng: np.random.Generator, omega: np.ndarray, mode: int) -> tuple
 
 
 def oracle_browse(rng: np.random.Generator, omega: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Spec 2.3: (omega, mode, number of ticks) once the user no longer browses."""
+    """(omega, mode, number of ticks) once the user no longer browses."""
     mode, num_ticks = ORGANIC, 0
     while mode == ORGANIC:
         omega, mode = oracle_tick(rng, omega, mode)
@@ -66,14 +66,14 @@ def oracle_browse(rng: np.random.Generator, omega: np.ndarray) -> tuple[np.ndarr
 
 
 def oracle_reset(rng: np.random.Generator) -> tuple[np.ndarray, int]:
-    """Spec 2.4: (omega, mode) at the first observation."""
+    """(omega, mode) at the first observation."""
     return oracle_browse(rng, rng.normal(size=16))[:2]
 
 
 def oracle_step(
     rng: np.random.Generator, omega: np.ndarray, mode: int, product: int
 ) -> tuple[np.ndarray, int, bool]:
-    """Spec 3, rules 1 to 4: (omega, mode, whether the product was clicked)."""
+    """Rules 1 to 4 of "A step": (omega, mode, whether the product was clicked)."""
     is_clicked = rng.random() < oracle_probability(BETA[product] @ omega + MU[product])
     omega, mode = oracle_tick(rng, omega, mode)
     if is_clicked:
@@ -207,7 +207,7 @@ def test_clicks_follow_their_probability(stepped) -> None:
 
 
 def test_what_follows_from_a_step_exactly(stepped) -> None:
-    """Counters, flags, rate and observation, from the state that the step drew (spec 3 to 6)."""
+    """Counters, flags, rate and observation, from the state that the step drew."""
     before, _, (obs, after, reward, terminated, truncated, info) = stepped
     assert set(np.unique(reward)) == {0, 1}
     assert set(np.unique(after.mode)) == {BANDIT, STOP}

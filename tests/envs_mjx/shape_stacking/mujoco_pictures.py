@@ -71,7 +71,7 @@ def text(values: Any) -> str:
 
 
 def scene_xml(scene: dict[str, Any]) -> str:
-    """Spec 1, 2.1, 6.1 and 6.2 as a model; one picture element per pixel."""
+    """Table, colours, camera and lights of the task as a model; one picture element per pixel."""
     library, assets, world = shape_library(), "", ""
     for k, (i, position, quaternion) in enumerate(scene["shapes"]):
         name, s = CLASS_NAMES[library.class_labels[i]], library.s[i]

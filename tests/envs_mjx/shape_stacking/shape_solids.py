@@ -1,4 +1,4 @@
-"""Shape Stacking's solids as NumPy knows them, written from the spec's table (2.2).
+"""Shape Stacking's solids as NumPy knows them, by the table of docs/shape_stacking.md, "Solids".
 
 Each is a function that is negative inside, zero on the surface and positive outside.
 """

@@ -1,4 +1,4 @@
-"""Pictures of towers (spec shape_stacking 6; checks 18 and 19)."""
+"""Pictures of towers (docs/shape_stacking.md, "Camera", "Light", "Play data")."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def silhouette(*arguments: Any) -> np.ndarray:
 
 @pytest.mark.parametrize("has_shadows", [True, False])
 def test_reference_frame(has_shadows: bool) -> None:
-    """Spec 6.3 and check 18."""
+    """Figures of docs/shape_stacking.md, "Light"."""
     picture = np.asarray(gray(*REFERENCE, task_camera(), has_shadows=has_shadows)) / 255
     assert picture.mean() == pytest.approx(0.0515, abs=0.001)
     assert (picture > 0).mean() == pytest.approx(0.176, abs=0.002)
@@ -101,13 +101,13 @@ def test_a_larger_picture_has_the_pixels_of_the_small_one() -> None:
 
 
 def test_the_original_casts_shadows() -> None:
-    """The mean of spec 6.3 is nearer with them: 0.0516 and 0.0524 for 0.0515."""
+    """The mean of the reference frame is nearer with them: 0.0516 and 0.0524 for 0.0515."""
     means = [np.mean(gray(*REFERENCE, task_camera(), has_shadows=on)) / 255 for on in (True, False)]
     assert abs(means[0] - 0.0515) < 0.0003
     assert means[1] - means[0] > 0.0005
 
 
-# Spec 7: pixels and mean RGB over the silhouette from 0, 90, 180 and 270 degrees, height 1.
+# Pixels and mean RGB over the silhouette from 0, 90, 180 and 270 degrees, height 1.
 PLAY = {
     690: ((1146,) * 4, (0.383, 0.647, 0.383, 0.383)),
     735: ((904,) * 4, (0.401, 0.623, 0.402, 0.300)),
@@ -130,7 +130,7 @@ def around(shape_id: int) -> np.ndarray:
 
 @pytest.mark.parametrize("shape_id", PLAY)
 def test_play_silhouettes_and_means(shape_id: int) -> None:
-    """Check 19. The means of the original include pixels that its four samples cover in part."""
+    """The means of the original include pixels that its four samples cover in part."""
     pixels, means = PLAY[shape_id]
     pictures = around(shape_id) / 255
     covered = pictures.any(-1)
@@ -155,7 +155,7 @@ def test_arch_is_open() -> None:
 
 
 def test_columns_grow_with_x_and_rows_shrink_with_z() -> None:
-    """Spec 6.1: column = 41.5 + 101.4 x / (7 - y), row = 41.5 - 101.4 (z - 2) / (7 - y)."""
+    """Column = 41.5 + 101.4 x / (7 - y), row = 41.5 - 101.4 (z - 2) / (7 - y)."""
     for x, y, z in ((1.5, 0.0, 1.0), (-1.0, 1.5, 3.0), (0.7, -1.9, 0.2)):
         covered = silhouette(*scene((725, (x, y, z))), task_camera())
         row, column = np.argwhere(covered).mean(0)
@@ -173,7 +173,7 @@ def test_pitch_of_the_front_camera() -> None:
 
 
 def test_camera_of_two_dimensions_looks_down() -> None:
-    """Spec 6.1: from (0, 4, 5) along -y and down by 0.77 rad; mirrored the same way."""
+    """From (0, 4, 5) along -y and down by 0.77 rad; mirrored the same way."""
     camera = task_camera(2)
     offset = np.array([0.8, 0.5, 0.3]) - (0, 4, 5)
     forward = np.array([0, -np.sin(0.8), -np.cos(0.8)])
@@ -199,7 +199,7 @@ def test_orbit_is_not_mirrored() -> None:
 
 
 def test_light_by_hand() -> None:
-    """Spec 6.2 for a row of pixels on the front of cube 690 at the origin, seen from +y."""
+    """By "Light" for a row of pixels on the front of cube 690 at the origin, seen from +y."""
     picture = np.asarray(around(690)[1])
     s, color = LIBRARY.s[690], LIBRARY.color[690]
     position = np.array([0, 2, 1.0])

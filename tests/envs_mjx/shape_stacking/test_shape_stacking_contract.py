@@ -65,7 +65,7 @@ def test_ends_are_never_merged(rollout) -> None:
 
 
 def test_rewards_are_paid_at_ends_only(rollout) -> None:
-    """Check 21; nothing is higher than ten bounding spheres of the largest shape."""
+    """Nothing is higher than ten bounding spheres of the largest shape."""
     contract.check_rewards(rollout, low=0.0, high=15.0)
     np.testing.assert_array_equal(rollout.reward > 0.0, rollout.done)
 
@@ -86,7 +86,7 @@ def test_invalid_actions_are_counted() -> None:
 
 
 def test_old_frames_are_zero_after_resets_and_then_move_up(rollout) -> None:
-    """Check 20: the stack of every first observation, and of those that follow."""
+    """The stack of every first observation, and of those that follow."""
     first = np.concatenate([rollout.first_obs, rollout.obs[rollout.done]])
     assert not first[..., :-1].any()
     assert first[..., -1].any(axis=(1, 2)).all()

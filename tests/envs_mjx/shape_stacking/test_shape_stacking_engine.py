@@ -1,4 +1,4 @@
-"""MuJoCo's C engine: the figures of spec shape_stacking 13, and what every engine promises."""
+"""MuJoCo's C engine: reference figures, and what every engine promises."""
 
 from __future__ import annotations
 
@@ -49,15 +49,15 @@ def assert_same(found: Any, expected: Any) -> None:
 
 
 @pytest.mark.golden
-def test_figures_of_the_spec(engine: MujocoC) -> None:
-    """Checks 3, 4 and 6 to 15 with the spec's tolerances (0.005 where it gives none)."""
+def test_reference_figures(engine: MujocoC) -> None:
+    """3, 4 and 6 to 15 of docs/shape_stacking.md, "Reference figures", with its tolerances."""
     rows = stacking.measured(engine)
     asserted = [row for row in rows if row.tolerance is not None]
     assert len(asserted) > 70
     assert {row.check for row in asserted} == {3, 4, *range(6, 16)}
     wrong = [r for r in asserted if not abs(r.value - float(r.spec)) <= float(r.tolerance or 0)]
     assert wrong == []
-    # Check 9: off its centre by 0.03, the upper sphere falls off the lower one.
+    # Figure 9: off its centre by 0.03, the upper sphere falls off the lower one.
     fallen = next(row for row in rows if row.spec == "falls off")
     assert fallen.value < 0.5
 
@@ -72,7 +72,7 @@ def test_04_the_start_scene_stays(engine: MujocoC) -> None:
 
 @pytest.mark.golden
 def test_several_contacts_hold_a_tower_straighter(engine: MujocoC) -> None:
-    """Spec 10: with one contact per pair, towers of hulls creep; with several they stand."""
+    """With one contact per pair, towers of hulls creep; with several they stand."""
     drops = [((690, -0.65), (684, -0.65), (678, -0.65))]
     drift = {}
     for name, one in (("one", engine), ("several", MujocoC(has_multiple_contacts=True))):
@@ -291,7 +291,7 @@ def test_input_is_left_as_it_was(short: MujocoC) -> None:
 
 @pytest.mark.contract
 def test_engine_and_rules_in_one_program(engine: MujocoC) -> None:
-    """Check 6 as an environment would play it: place, settle, reward in one jitted function."""
+    """Figure 6 as an environment would play it: place, settle, reward in one jitted function."""
 
     @jax.jit
     def play(position: jax.Array) -> tuple[jax.Array, jax.Array]:

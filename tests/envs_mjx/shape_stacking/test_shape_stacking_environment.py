@@ -1,4 +1,7 @@
-"""Shape Stacking's own rules, as an agent meets them (spec shape_stacking 3 to 6, 13)."""
+"""Shape Stacking's own rules, as an agent meets them.
+
+Numbers are those of docs/shape_stacking.md, "Reference figures".
+"""
 
 from __future__ import annotations
 
@@ -32,7 +35,7 @@ class Recorder:
 
 
 def started(env: ShapeStacking, cylinder: int = 799) -> StackingState:
-    """The scene of the spec's checks: cylinders at x = -0.65 and 0.65."""
+    """The scene of the reference figures: cylinders at x = -0.65 and 0.65."""
     return env.start_from(rules.start(cylinder, 0.0, 1.3))[1]
 
 
@@ -55,7 +58,7 @@ STILL = ShapeStacking(Recorder())
 
 @pytest.mark.parametrize(("cylinder", "height"), [(798, 0.328), (799, 0.342), (800, 0.355)])
 def test_stop_at_once(cylinder: int, height: float) -> None:
-    """Checks 4 and 21."""
+    """Figures 4 and 21."""
     _, reward, terminated, truncated, info = act(REAL, started(REAL, cylinder), 690, 0.0, stop=True)
     assert (terminated, truncated) == (True, False)
     assert info["final_height"] == pytest.approx(height, abs=0.001)
@@ -64,7 +67,7 @@ def test_stop_at_once(cylinder: int, height: float) -> None:
 
 
 def test_a_shape_is_placed_once() -> None:
-    """Check 6: heights of the first cube; the second time nothing changes but a counter."""
+    """Figure 6: heights of the first cube; the second time nothing changes but a counter."""
     state, reward, terminated, truncated, info = act(REAL, started(REAL), 690, -0.65)
     assert (reward, terminated, truncated) == (0.0, False, False)
     assert info["final_height"] == pytest.approx(0.982, abs=0.005)
@@ -81,7 +84,7 @@ def test_a_shape_is_placed_once() -> None:
 
 
 def test_only_a_new_shape_stops_the_others() -> None:
-    """Spec 4: repeated shapes and stops leave velocities as they are."""
+    """Repeated shapes and stops leave velocities as they are."""
     state, *_ = act(STILL, started(STILL), 690, -0.65)
     moving = state.bodies.replace(qvel=jnp.ones_like(state.bodies.qvel))
     state = state.replace(bodies=moving)
@@ -91,14 +94,14 @@ def test_only_a_new_shape_stops_the_others() -> None:
 
 
 def test_a_start_cylinder_is_no_placed_shape() -> None:
-    """Its id may be in the action set too, as a body of its own (spec 3, item 2)."""
+    """Its id may be in the action set too, as a body of its own."""
     state, *_, info = act(STILL, started(STILL), 799, 0.5)
     assert (info["num_placed"], info["num_repeats"]) == (1, 0)
     assert state.bodies.shape_ids.tolist() == [799, 799, 799, *[-1] * 9]
 
 
 def test_drop_pose_and_clipping() -> None:
-    """Check 5, and a position beyond what is allowed."""
+    """Figure 5, and a position beyond what is allowed."""
     library = shape_library()
     state, *_ = act(STILL, started(STILL), 690, 1.7)
     assert state.bodies.qpos[2, :3] == pytest.approx((1.0, 0.0, 0.819), abs=0.001)
@@ -194,7 +197,6 @@ def test_an_id_that_does_not_exist_uses_the_action_up(shape_id: int) -> None:
 
 
 def test_start_scenes_are_uniform() -> None:
-    """Spec 3, item 2."""
     keys = jax.random.split(jax.random.key(3), 900)
     bodies = jax.jit(jax.vmap(lambda key: STILL.reset_env(key, STILL.default_params)[1].bodies))(
         keys

@@ -63,7 +63,7 @@ def test_a_shape_is_let_go_where_the_action_said(engine: MujocoC) -> None:
     after = state_of(dropped(engine, start, SLOT, CUBE, 1.0), 1)
     found = films.let_go(state_of(start), after, action(CUBE, 1.5))
     assert found.shape_ids.tolist()[: SLOT + 1] == [799, 799, CUBE]
-    # Spec 13, check 5: 0.819; positions end at 1.
+    # Reference figure 5: 0.819; positions end at 1.
     np.testing.assert_allclose(found.qpos[SLOT, :3], (1.0, 0.0, 0.819), atol=5e-4)
     two = films.let_go(state_of(start), after, action(CUBE, 0.25, -0.5))
     np.testing.assert_allclose(two.qpos[SLOT, :2], (0.25, -0.5))

@@ -1,4 +1,4 @@
-"""The padded collision hulls (spec shape_stacking 11.2, item 3; check 2)."""
+"""The padded collision hulls (docs/shape_stacking.md, "Solids", "Engines")."""
 
 from __future__ import annotations
 
@@ -147,7 +147,7 @@ def test_hulls_stand_on_their_centers_of_mass() -> None:
 
 
 def test_radius_of_round_hulls_is_that_of_equal_area() -> None:
-    """Spec 11.2: factor 1.023 for the 12-gons of cylinder and cone; the dome's arc stays."""
+    """Factor 1.023 for the 12-gons of cylinder and cone; the dome's arc stays."""
     table = hull_table()
     for name in ("cylinder", "cone", "cone-hires"):
         widths = np.hypot(*table.vertices[CLASS_NAMES.index(name), :12, :2].T)

@@ -1,6 +1,6 @@
-"""The MJX engine: spec shape_stacking 13, MuJoCo's C engine, and what every engine promises.
+"""The MJX engine: reference figures, MuJoCo's C engine, and what every engine promises.
 
-All scenes run as worlds of one compiled program, of five slots: the tallest tower of the checks is
+All scenes run as worlds of one compiled program, of five slots: the tallest tower of the figures is
 three shapes beside two cylinders.
 """
 
@@ -94,13 +94,12 @@ def assert_near(found: Any, expected: Any, atol: float) -> None:
         np.testing.assert_allclose(np.asarray(one), np.asarray(other), atol=atol)
 
 
-def assert_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
-    """Checks 3, 4 and 6 to 15.
+def assert_reference_figures(engine: OneProgram, c_engine: MujocoC) -> None:
+    """3, 4 and 6 to 15 of docs/shape_stacking.md, "Reference figures".
 
-    The spec's figures of three checks are of hulls on hulls in one point, where towers creep
-    (spec 10); those rest as in C with several, within the 0.02 m that the spec suggests for MJX but
-    for a tower of three cubes. In check 12 a sphere is wedged between cylinders, which are 12-gons
-    here.
+    Three of them are of hulls on hulls in one point, where towers creep; those rest as in C with
+    several, within the 0.02 m that the page has for MJX but for a tower of three cubes. In 12 a
+    sphere is wedged between cylinders, which are 12-gons here.
     """
     rows = stacking.measured(engine)
     in_c = stacking.measured(c_engine)
@@ -125,8 +124,8 @@ def assert_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
 
 
 @pytest.mark.golden
-def test_figures_of_the_spec(engine: OneProgram, c_engine: MujocoC) -> None:
-    assert_figures_of_the_spec(engine, c_engine)
+def test_reference_figures(engine: OneProgram, c_engine: MujocoC) -> None:
+    assert_reference_figures(engine, c_engine)
 
 
 @pytest.fixture(scope="module")
@@ -136,8 +135,8 @@ def all_slots() -> OneProgram:
 
 @pytest.mark.golden
 @pytest.mark.slow
-def test_figures_of_the_spec_in_all_slots(all_slots: OneProgram, c_engine: MujocoC) -> None:
-    assert_figures_of_the_spec(all_slots, c_engine)
+def test_reference_figures_in_all_slots(all_slots: OneProgram, c_engine: MujocoC) -> None:
+    assert_reference_figures(all_slots, c_engine)
 
 
 @pytest.mark.golden

@@ -1,4 +1,4 @@
-"""Shape Stacking's play environment (spec shape_stacking 7)."""
+"""Shape Stacking's play environment (docs/shape_stacking.md, "Play data")."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rays against every solid, beside a search along each ray (spec shape_stacking 2.2, 11.4)."""
+"""Rays against every solid, beside a search along each ray."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Rules of stacking against a NumPy version, and figures of the spec (3, 4, 5)."""
+"""Rules of stacking against a NumPy version, and figures worked by hand."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_drops_and_rewards_equal_numpy(seed: int, num_used: int, new: int) -> No
 
 @pytest.mark.golden
 def test_start_scene() -> None:
-    """Spec 3: cylinder 800 at rest on the table, c = 0.1, gap = 1.4; the rest is parked."""
+    """Cylinder 800 at rest on the table, c = 0.1, gap = 1.4; the rest is parked."""
     bodies = rules.start(800, 0.1, 1.4)
     assert bodies.shape_ids.tolist() == [800, 800, *[-1] * 10]
     np.testing.assert_allclose(bodies.qpos[0, :3], [-0.6, 0.0, -0.5 + 0.35586], atol=1e-5)
@@ -105,7 +105,7 @@ def test_placing_turns_the_shape_and_stops_everything() -> None:
 
 @pytest.mark.golden
 def test_reward_of_known_heights() -> None:
-    """Spec 5: 0.5 * (0.7 + 0.5) + 0.5 * mean(0.2, 0.7); paper: heights 0.34, 0.34, 0.7, 1.2."""
+    """0.5 * (0.7 + 0.5) + 0.5 * mean(0.2, 0.7); paper: heights 0.34, 0.34, 0.7, 1.2."""
     bodies = rules.start(799, 0.0, 1.3)
     for slot, z in ((2, 0.2), (3, 0.7)):
         bodies = rules.place(bodies, slot, 690, jnp.zeros(2))

@@ -1,4 +1,4 @@
-"""The compiled models: options of spec shape_stacking 1, bodies and geoms of the library."""
+"""The compiled models: options of the world, bodies and geoms of the library."""
 
 from __future__ import annotations
 
@@ -104,7 +104,7 @@ def test_every_body_has_the_mass_and_inertia_of_the_library(catalogue: mujoco.Mj
     axes = axes.reshape(-1, 3, 3)
     full = np.einsum("nij,nj,nkj->nik", axes, catalogue.body_inertia[1:], axes)
     np.testing.assert_allclose(full, library.inertia[ids], rtol=1e-9, atol=1e-9)
-    # What makes contacts soft, spec 11.2, item 5.
+    # What makes contacts soft.
     softness = np.stack([1.0 / library.mass[ids], (1.0 / inertias).mean(axis=1)], axis=1)
     np.testing.assert_allclose(catalogue.body_invweight0[1:], softness, rtol=1e-9)
 

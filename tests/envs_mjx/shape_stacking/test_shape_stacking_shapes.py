@@ -1,4 +1,7 @@
-"""The shape library: ids, colours, mass and inertia of every class (spec shape_stacking 2)."""
+"""The shape library: ids, colours, mass and inertia of every class.
+
+Figures: docs/shape_stacking.md, "Ids", "Solids" and "Radius and mass".
+"""
 
 from __future__ import annotations
 
@@ -16,7 +19,7 @@ from tests.envs_mjx.shape_stacking.shape_solids import SOLIDS
 pytestmark = pytest.mark.golden
 
 PI = np.pi
-# Spec 2.1: first id, last id, class, scales, range of s, angles, upper end of the angles.
+# First id, last id, class, scales, range of s, angles, upper end of the angles.
 IDS = [
     (0, 59, "middle_triangle", 6, 0.08, 0.40, 10, PI),
     (60, 119, "hat", 6, 0.08, 0.40, 10, PI),
@@ -35,7 +38,7 @@ IDS = [
     (750, 779, "capsule", 30, 0.08, 0.32, 1, 0),
     (780, 809, "cylinder", 30, 0.08, 0.48, 1, 0),
 ]
-# Spec 2.2 and 2.3: base, top, centre of mass (x, z), volume, radius of the drop rule; s = 1.
+# Base, top, centre of mass (x, z), volume, radius of the drop rule; s = 1.
 GEOMETRY = {
     "cube": (-1, 1, (0, 0), 8, 1.732),
     "rectangle": (-2, 2, (0, 0), 16, 2.449),
@@ -94,7 +97,7 @@ def test_counts_and_start_cylinders() -> None:
 def test_colors_of_the_original() -> None:
     color = shape_library().color
     np.testing.assert_allclose(color[799], (0.2321, 0.6973, 0.5357), atol=5e-5)
-    # The spec gives three digits, the first of id 690 cut instead of rounded.
+    # The page gives three digits, the first of id 690 cut instead of rounded.
     np.testing.assert_allclose(color[690], (0.136, 0.839, 0.648), atol=6e-4)
     np.testing.assert_allclose(color[290], (0.179, 0.934, 0.922), atol=6e-4)
 
@@ -104,7 +107,7 @@ def test_geometry_of_the_spec_scales_with_s(name: str) -> None:
     base, top, (x, z), volume, radius = GEOMETRY[name]
     library, ids = shape_library(), ids_of(name)
     s = library.s[ids]
-    # Half a unit of the last digit of the spec's table, relative to lengths of about 1.
+    # Half a unit of the last digit of the page's table, relative to lengths of about 1.
     np.testing.assert_allclose(library.base[ids], base * s, atol=1e-12)
     np.testing.assert_allclose(library.top[ids] / s, top, atol=3e-4)
     np.testing.assert_allclose(library.volume[ids] / s**3, volume, rtol=2e-4)
@@ -193,7 +196,7 @@ def test_principal_axes_give_the_inertia_back(name: str) -> None:
 
 
 def test_drop_heights_of_the_spec() -> None:
-    """Spec 13, check 5: cylinders 799 at rest, then a cube and a sphere."""
+    """Reference figure 5: cylinders 799 at rest, then a cube and a sphere."""
     library = shape_library()
     top = -0.5 + library.s[799] + library.bounding_radius[799]
     for shape_id, height in ((690, 0.819), (735, 0.658)):

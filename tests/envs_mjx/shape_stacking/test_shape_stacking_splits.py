@@ -1,4 +1,4 @@
-"""The published splits of shapes (spec shape_stacking 9)."""
+"""The published splits of shapes (docs/shape_stacking.md, "Splits")."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_full_parts_by_class() -> None:
 
 @pytest.mark.parametrize("name", ["default", "full"])
 def test_validation_is_the_first_half_of_the_shuffled_rest(name: str) -> None:
-    """Spec method 2.1: `RandomState(41)`, the first floor(n / 2) are for validation."""
+    """`RandomState(41)`, the first floor(n / 2) are for validation."""
     split = published_split(name)
     held_out = sorted({*range(810)} - {*split.train.tolist()})
     order = np.random.RandomState(41).permutation(len(held_out))

@@ -66,7 +66,7 @@ def test_the_page_holds_the_bodies_of_the_episode(system: dict[str, Any]) -> Non
     colors = np.array([system["geoms"][name][0]["rgba"] for name in NAMES])
     library = shape_library().color
     np.testing.assert_array_equal(colors[:, :3], library[[799, 799, CUBE, ARCH]])
-    np.testing.assert_allclose(colors[0], (0.2321, 0.6973, 0.5357, 1.0), atol=1e-4)  # Spec 2.1.
+    np.testing.assert_allclose(colors[0], (0.2321, 0.6973, 0.5357, 1.0), atol=1e-4)
     np.testing.assert_allclose(colors[2], (0.136, 0.839, 0.648, 1.0), atol=1e-3)
 
 
@@ -104,7 +104,7 @@ def test_bodies_wait_above_their_first_place(
 
 @pytest.mark.golden
 def test_the_table_is_that_of_the_spec(system: dict[str, Any]) -> None:
-    """Spec 1: half-sizes 4 by 2, top at -0.5. Brax's `createPlane` takes whole sizes."""
+    """Half-sizes 4 by 2, top at -0.5. Brax's `createPlane` takes whole sizes."""
     (table,) = system["geoms"]["world"]
     assert (table["name"], table["pos"]) == ("Plane", [0.0, 0.0, -0.5])
     assert (table["size"][:2], table["rgba"]) == ([8.0, 4.0], [0.9, 0.9, 0.9, 1.0])
