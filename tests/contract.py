@@ -1,4 +1,4 @@
-"""The promises of every environment (style 34), as functions over any `Environment`.
+"""The promises of every environment, as functions over any `Environment`.
 
 A domain's contract test records one rollout and hands it to the `check_*` functions, so that a
 whole list costs one or two compiles:

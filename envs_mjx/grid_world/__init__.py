@@ -1,6 +1,11 @@
-"""Grid World: navigation with five-move skills past a lava river (spec grid_world)."""
+"""Grid World: navigation with five-move skills past a lava river (docs/grid_world.md)."""
 
-from envs_mjx.grid_world.environment import GridWorld, GridWorldParams, GridWorldState
+from envs_mjx.grid_world.environment import (
+    GridWorld,
+    GridWorldParams,
+    GridWorldSettings,
+    GridWorldState,
+)
 from envs_mjx.grid_world.skills import skill_universe
 
-__all__ = ["GridWorld", "GridWorldParams", "GridWorldState", "skill_universe"]
+__all__ = ["GridWorld", "GridWorldParams", "GridWorldSettings", "GridWorldState", "skill_universe"]

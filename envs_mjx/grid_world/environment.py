@@ -1,7 +1,9 @@
-"""Grid World: cross a lava river to the goal with five-move skills (spec grid_world)."""
+"""Grid World: cross a lava river to the goal with five-move skills (docs/grid_world.md)."""
 
 from __future__ import annotations
 
+import math
+from dataclasses import dataclass
 from typing import TypeVar
 
 import chex
@@ -29,25 +31,56 @@ EMPTY, WALL, GOAL, LAVA, AGENT, SUBGOAL = 1, 2, 8, 9, 10, 11
 Array = TypeVar("Array", int, np.ndarray, jax.Array)
 
 
-@struct.dataclass
-class GridWorldParams:
-    """Rules of the task; every field is traced (spec grid_world 3).
+@dataclass(frozen=True)
+class GridWorldSettings:
+    """What a run may set; the defaults are the published task.
 
     Attributes:
-      max_moves: int32[] >= 1, moves after which an episode is truncated; also the number that the
-        time penalty is relative to.
-      subgoal_reward: f32[] reward of the first visit to the opening.
-      goal_reward: f32[] reward of the goal before the time penalty.
-      time_penalty: f32[] subtracted at the goal, times `num_moves / max_moves`.
-      fixed_layout: int32[] 0..41 plays this layout always (larger numbers mean 41); a negative
-        number draws one of the 42 at every reset.
+      max_moves: moves after which an episode is truncated, 1 or more; also the number that the time
+        penalty is relative to.
+      subgoal_reward: of the first visit to the opening; finite.
+      goal_reward: of the goal before the time penalty; finite.
+      time_penalty: subtracted at the goal, times `num_moves / max_moves`; finite.
+      fixed_layout: 0..41 plays this layout always; -1 draws one of the 42 at every reset.
+
+    Raises:
+      ValueError: a number is out of its range.
     """
 
-    max_moves: int | jax.Array = 50
-    subgoal_reward: float | jax.Array = 0.1
-    goal_reward: float | jax.Array = 1.0
-    time_penalty: float | jax.Array = 0.9
-    fixed_layout: int | jax.Array = -1
+    max_moves: int = 50
+    subgoal_reward: float = 0.1
+    goal_reward: float = 1.0
+    time_penalty: float = 0.9
+    fixed_layout: int = -1
+
+    def __post_init__(self) -> None:
+        if self.max_moves < 1:
+            raise ValueError(f"max_moves={self.max_moves} must be 1 or more.")
+        if not -1 <= self.fixed_layout < NUM_LAYOUTS:
+            raise ValueError(
+                f"fixed_layout={self.fixed_layout} must be 0 to {NUM_LAYOUTS - 1}, or -1 to draw a "
+                "layout at every reset."
+            )
+        for name in ("subgoal_reward", "goal_reward", "time_penalty"):
+            if not math.isfinite(getattr(self, name)):
+                raise ValueError(f"{name}={getattr(self, name)} must be a finite number.")
+
+
+@struct.dataclass
+class GridWorldParams:
+    """Rules of the task; every field is traced, and means what it means in `GridWorldSettings`.
+
+    Attributes:
+      max_moves: int32[] >= 1.
+      subgoal_reward, goal_reward, time_penalty: f32[].
+      fixed_layout: int32[]; above 41 means 41, and any negative number draws.
+    """
+
+    max_moves: int | jax.Array = GridWorldSettings.max_moves
+    subgoal_reward: float | jax.Array = GridWorldSettings.subgoal_reward
+    goal_reward: float | jax.Array = GridWorldSettings.goal_reward
+    time_penalty: float | jax.Array = GridWorldSettings.time_penalty
+    fixed_layout: int | jax.Array = GridWorldSettings.fixed_layout
 
 
 @struct.dataclass
@@ -70,7 +103,7 @@ class GridWorldState:
 
 
 def decode_layout(layout: Array) -> tuple[Array, Array, Array]:
-    """What a layout id means (spec grid_world 1.1).
+    """What a layout id means (docs/grid_world.md, "Layouts").
 
     Args:
       layout: integer[...] in 0..41, Python, NumPy or JAX.
@@ -97,13 +130,13 @@ def encode_layout(is_horizontal: bool, position: int, opening: int) -> int:
 
 
 def is_wall() -> np.ndarray:
-    """bool[9, 9] the outer ring, indexed [x, y]; the same in every layout. Spec grid_world 1."""
+    """bool[9, 9] the outer ring, indexed [x, y]; the same in every layout."""
     x, y = np.ogrid[:GRID_SIZE, :GRID_SIZE]
     return (np.minimum(x, y) < FIRST_CELL) | (np.maximum(x, y) > LAST_CELL)
 
 
 class GridWorld(Environment[GridWorldState, GridWorldParams]):
-    """A 9 x 9 grid with a lava river between start and goal (spec grid_world, `GridWorld-v0`).
+    """A 9 x 9 grid with a lava river between start and goal.
 
     Observation: f32[81], the object id of cell (x, y) in element `9 * x + y`, each in 1..11: 1
       empty, 2 wall, 8 goal, 9 lava, 10 agent (hides what is below it), 11 opening (sub-goal). The
@@ -132,10 +165,27 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
     name = "GridWorld-v0"
     episode_metrics = ("is_success", "has_reached_subgoal", "episode_length", "episode_return")
 
+    def __init__(
+        self,
+        max_moves: int = GridWorldSettings.max_moves,
+        subgoal_reward: float = GridWorldSettings.subgoal_reward,
+        goal_reward: float = GridWorldSettings.goal_reward,
+        time_penalty: float = GridWorldSettings.time_penalty,
+        fixed_layout: int = GridWorldSettings.fixed_layout,
+    ) -> None:
+        """Takes the fields of `GridWorldSettings`, which become `default_params`.
+
+        Raises:
+          ValueError: a number is out of its range.
+        """
+        self._settings = GridWorldSettings(
+            max_moves, subgoal_reward, goal_reward, time_penalty, fixed_layout
+        )
+
     @property
     def default_params(self) -> GridWorldParams:
-        """The published task."""
-        return GridWorldParams()
+        """The task as it was set; the published one if nothing was."""
+        return GridWorldParams(**vars(self._settings))
 
     @property
     def action_spec(self) -> ActionSpec:
@@ -212,7 +262,7 @@ def _first_state(key: jax.Array, params: GridWorldParams) -> GridWorldState:
 
 
 def _observe(state: GridWorldState) -> jax.Array:
-    """f32[81] object ids with the agent on top (spec grid_world 4).
+    """f32[81] object ids with the agent on top.
 
     Compares each cell with the few numbers that make a layout: measured faster than a gather from
     a bank of the 42 layouts.
@@ -237,7 +287,7 @@ def _observe(state: GridWorldState) -> jax.Array:
 def _transition(
     state: GridWorldState, action: Action, params: GridWorldParams
 ) -> tuple[GridWorldState, jax.Array, jax.Array, jax.Array, Info]:
-    """One skill, move by move (spec grid_world 3): (state, reward, terminated, truncated, info)."""
+    """One skill, move by move: (state, reward, terminated, truncated, info)."""
     chex.assert_shape(state.agent_xy, (2,))
     chex.assert_rank(action.id, 0)
     is_valid = (action.id >= 0) & (action.id < NUM_SKILLS)

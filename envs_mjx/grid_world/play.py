@@ -1,4 +1,7 @@
-"""Grid World's play environment: what each skill does in a large empty room (spec grid_world 5)."""
+"""Grid World's play environment: what each skill does in a large empty room.
+
+See docs/grid_world.md, "Play data".
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,7 @@ NUM_POSITIONS = NUM_MOVES + 1
 def record(
     key: jax.Array, skill_ids: jax.Array, num_recordings: int, has_border: bool = True
 ) -> jax.Array:
-    """Plays every skill from random cells of the 80 x 80 room (spec grid_world 5).
+    """Plays every skill from random cells of the 80 x 80 room.
 
     With the border, free cells are 1..78 in both coordinates, starts are uniform over all of them
     but the goal's cell (78, 78), and each move is stopped by the walls. Without it no wall is ever
@@ -53,7 +56,7 @@ def _record_skill(
 
 
 def trajectory(start_xy: jax.Array, skill_id: jax.Array, has_border: bool = True) -> jax.Array:
-    """The cells that one skill visits (spec grid_world 5).
+    """The cells that one skill visits.
 
     Args:
       start_xy: int32[..., 2] cells (x, y).
@@ -73,7 +76,7 @@ def trajectory(start_xy: jax.Array, skill_id: jax.Array, has_border: bool = True
 
 
 def featurize_xy(stored: jax.Array) -> jax.Array:
-    """Raw coordinates, unscaled (spec grid_world 5, `xy`).
+    """Raw coordinates, unscaled (`xy`).
 
     Args:
       stored: uint8[..., 6, 2] from `record`.
@@ -102,7 +105,7 @@ def featurize_relative(stored: jax.Array) -> jax.Array:
 
 
 def featurize_onehot(stored: jax.Array) -> jax.Array:
-    """One-hot coordinates (spec grid_world 5, `one-hot`): 80 numbers for x, then 80 for y.
+    """One-hot coordinates (`onehot`): 80 numbers for x, then 80 for y.
 
     Args:
       stored: uint8[..., 6, 2] from `record`, values in 0..79.

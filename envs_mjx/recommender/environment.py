@@ -1,10 +1,12 @@
-"""The Recommender task: products for a user until the user leaves (spec recommender).
+"""The Recommender task: products for a user until the user leaves (docs/recommender.md).
 
 The user browses alone (*organic*), waits for a recommendation (*bandit*) or has left (*stop*). Each
 *tick* moves the user's taste; a stretch of browsing is several ticks, which are drawn at once.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -16,9 +18,27 @@ from jaxnew.environment import Action, ActionSpec, Environment, Info, Observatio
 
 ORGANIC, BANDIT, STOP = range(3)
 
-# Mode after a tick, by mode before it (spec recommender 2.2).
+# Mode after a tick, by mode before it (docs/recommender.md, "Ticks").
 TRANSITIONS = np.array([[0.74, 0.25, 0.01], [0.05, 0.94, 0.01], [0.0, 0.0, 1.0]])
-_DRIFT = 0.1  # Of taste per tick, times |N(0, 1)| (spec recommender 2.2).
+_DRIFT = 0.1  # Of taste per tick, times |N(0, 1)|.
+
+
+@dataclass(frozen=True)
+class RecommenderSettings:
+    """What a run may set; the default is the published task.
+
+    Attributes:
+      max_recommendations: recommendations after which an episode is cut, 1 or more.
+
+    Raises:
+      ValueError: the number is out of its range.
+    """
+
+    max_recommendations: int = 100
+
+    def __post_init__(self) -> None:
+        if self.max_recommendations < 1:
+            raise ValueError(f"max_recommendations={self.max_recommendations} must be 1 or more.")
 
 
 @struct.dataclass
@@ -33,7 +53,7 @@ class RecommenderParams:
 
     product_vectors: jax.Array
     product_constants: jax.Array
-    max_recommendations: jax.Array | int = 100
+    max_recommendations: jax.Array | int = RecommenderSettings.max_recommendations
 
 
 @struct.dataclass
@@ -71,11 +91,21 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
     name = "Recommender-v0"
     episode_metrics = ("click_through_rate", "num_clicks", "episode_length")
 
+    def __init__(self, max_recommendations: int = RecommenderSettings.max_recommendations) -> None:
+        """Takes the fields of `RecommenderSettings`, which become `default_params`.
+
+        Raises:
+          ValueError: a number is out of its range.
+        """
+        self._settings = RecommenderSettings(max_recommendations)
+
     @property
     def default_params(self) -> RecommenderParams:
-        """The published task."""
+        """The published products, and the task as it was set."""
         return RecommenderParams(
-            jnp.asarray(product_vectors()), jnp.asarray(product_constants()), jnp.int32(100)
+            jnp.asarray(product_vectors()),
+            jnp.asarray(product_constants()),
+            jnp.int32(self._settings.max_recommendations),
         )
 
     @property
@@ -116,7 +146,7 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
         action: Action,
         params: RecommenderParams,
     ) -> Transition:
-        """One recommendation, without auto-reset (spec recommender 3); consumes `key`.
+        """One recommendation, without auto-reset; consumes `key`.
 
         Args:
           state: of an episode in progress; what follows an end is undefined.
@@ -158,7 +188,7 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
 def click_probability(logit: jax.Array) -> jax.Array:
     """Probability that a product is clicked, f32[...] in (0.012982, 0.731059).
 
-    `sig(14 sig(2 sig(0.3 x) - 2) - 6)`; source: spec recommender 3.1.
+    `sig(14 sig(2 sig(0.3 x) - 2) - 6)`: docs/recommender.md, "Click probability".
 
     Args:
       logit: f32[...] `beta . omega + mu`.
@@ -176,7 +206,7 @@ def _browsing_session(key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Ticks of a stretch of browsing, int32[] >= 1, and the mode it leads to; consumes `key`.
 
     Every tick leaves with probability 0.26, so their number is geometric; where to is independent
-    of it (spec recommender 2.3).
+    of it (docs/recommender.md, "Browsing").
     """
     key_ticks, key_exit = jax.random.split(key)
     stays, to_bandit, to_stop = TRANSITIONS[ORGANIC]
@@ -190,7 +220,7 @@ def _drift(key: jax.Array, omega: jax.Array, num_ticks: jax.Array) -> jax.Array:
 
     A tick adds `0.1 |n| N(0, I)` with one `n ~ N(0, 1)` for all coordinates. Normal variables add
     by their variances, so k ticks add `0.1 sqrt(Q) N(0, I)` with Q chi-square of k degrees of
-    freedom: the same distribution without a loop (spec recommender 2.3).
+    freedom: the same distribution without a loop.
     """
     key_scale, key_direction = jax.random.split(key)
     squares = jax.random.chisquare(key_scale, num_ticks.astype(jnp.float32))
@@ -198,5 +228,5 @@ def _drift(key: jax.Array, omega: jax.Array, num_ticks: jax.Array) -> jax.Array:
 
 
 def _observe(state: RecommenderState) -> jax.Array:
-    """f32[16] the direction of the taste (spec recommender 4)."""
+    """f32[16] the direction of the taste."""
     return state.omega / jnp.linalg.norm(state.omega)

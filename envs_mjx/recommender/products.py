@@ -1,4 +1,4 @@
-"""The 10,000 published products, bit for bit (spec recommender 1). NumPy only."""
+"""The 10,000 published products, bit for bit. NumPy only."""
 
 from __future__ import annotations
 

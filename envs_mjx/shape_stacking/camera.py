@@ -1,4 +1,7 @@
-"""Pictures of towers, by casting rays inside jit (spec shape_stacking 6, 7 and 11.4)."""
+"""Pictures of towers, by casting rays inside jit.
+
+See docs/shape_stacking.md, "Camera", "Light" and "Play data".
+"""
 
 from __future__ import annotations
 
@@ -11,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking.rays import Bodies, Hits, Vector, dot, nearest, normals, walk
+from envs_mjx.shape_stacking.scene import TABLE_HEIGHT
 from envs_mjx.shape_stacking.shapes import shape_library
 
 FRAME_SIZE = 84
-TABLE_HEIGHT = -0.5
+# The table as it is drawn: half-sizes along x and y, m, and gray.
+TABLE_HALF_SIZES = (4.0, 2.0)
+TABLE_COLOR = 0.9
 
 _FIELD_OF_VIEW = math.radians(45.0)
-_TABLE_HALF_SIZES = (4.0, 2.0)
-_TABLE_COLOR = 0.9
 _EMISSION = 0.25
 _AMBIENT = 0.1
 _HEADLIGHT = 0.4
@@ -48,7 +52,7 @@ class Camera:
 
 
 def task_camera(position_dim: int = 1) -> Camera:
-    """The camera of the stacking task (spec 6.1).
+    """The camera of the stacking task.
 
     The original renders upside down and never turns its rows over, so that the picture is upright
     but mirrored: columns grow with x although the camera looks along -y.
@@ -71,7 +75,7 @@ def task_camera(position_dim: int = 1) -> Camera:
 
 
 def orbit_camera(azimuth: jax.Array, height: jax.Array, distance: float = 2.0) -> Camera:
-    """A camera that looks at the origin, upright and not mirrored (spec 7).
+    """A camera that looks at the origin, upright and not mirrored.
 
     Args:
       azimuth: f32[] rad, from +x towards +y.
@@ -92,7 +96,7 @@ def render(
     *,
     has_shadows: bool = True,
 ) -> jax.Array:
-    """The observation of the task: shapes on their table (spec 6).
+    """The observation of the task: shapes on their table.
 
     The original casts shadows. Without them a picture costs a third and means rise by about 2 %.
 
@@ -161,7 +165,7 @@ def render_rgb(
     points = walk(origin, jnp.where(jnp.isfinite(hits.distance), hits.distance, 0.0), directions)
     light = _light(bodies, hits, points, camera, has_shadows)
     colors = jnp.asarray(library.color, jnp.float32)[ids]
-    color = jnp.where(hits.surface[:, None] < 0, _TABLE_COLOR, colors[hits.body])
+    color = jnp.where(hits.surface[:, None] < 0, TABLE_COLOR, colors[hits.body])
     light = jnp.where(jnp.isfinite(hits.distance), light, 0.0)
     picture = jnp.clip(color * light[:, None], 0.0, 1.0)
     return jnp.round(255.0 * picture).astype(jnp.uint8).reshape(size, size, 3)
@@ -170,7 +174,7 @@ def render_rgb(
 def _light(
     bodies: Bodies, hits: Hits, points: Vector, camera: Camera, has_shadows: bool
 ) -> jax.Array:
-    """f32[P] how bright surfaces are, relative to their colour (spec 6.2)."""
+    """f32[P] how bright surfaces are, relative to their colour."""
     normal = normals(bodies, hits, points)
     light = _AMBIENT + jnp.where(hits.surface < 0, 0.0, _EMISSION)
     light += _HEADLIGHT * jnp.maximum(-dot(normal, camera.forward), 0.0)
@@ -216,7 +220,7 @@ def _table_distance(origin: Vector, directions: Vector, has_table: bool) -> jax.
     distance = (TABLE_HEIGHT - origin[2]) / jnp.where(is_down, directions[2], -1.0)
     x, y, _ = walk(origin, distance, directions)
     is_met = is_down & (distance > 0.0)
-    is_met &= (jnp.abs(x) <= _TABLE_HALF_SIZES[0]) & (jnp.abs(y) <= _TABLE_HALF_SIZES[1])
+    is_met &= (jnp.abs(x) <= TABLE_HALF_SIZES[0]) & (jnp.abs(y) <= TABLE_HALF_SIZES[1])
     return jnp.where(is_met, distance, nowhere)
 
 

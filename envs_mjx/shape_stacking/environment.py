@@ -1,9 +1,12 @@
-"""The Shape Stacking task: a tower on two cylinders, from shapes let go one by one (spec 3 to 6).
+"""The Shape Stacking task: a tower on two cylinders, from shapes let go one by one.
 
-The observation is what a camera sees after every settling, the last four pictures of it.
+The observation is what a camera sees after every settling, the last four pictures of it. Rules:
+docs/shape_stacking.md.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
@@ -11,8 +14,8 @@ from flax import struct
 
 from envs_mjx.shape_stacking import rules, scene
 from envs_mjx.shape_stacking.camera import FRAME_SIZE, render, task_camera
-from envs_mjx.shape_stacking.engines import Engine, make_engine
-from envs_mjx.shape_stacking.rules import REWARD_VARIANTS, Bodies
+from envs_mjx.shape_stacking.engines import PHYSICS, Engine, Physics, make_engine
+from envs_mjx.shape_stacking.rules import REWARD_VARIANTS, Bodies, RewardVariant
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from jaxnew.environment import Action, ActionSpec, Environment, Info, ObservationSpec, Transition
 
@@ -20,16 +23,42 @@ STACK_SIZE = 4
 POSITION_DIMS = (0, 1, 2)
 
 
+@dataclass(frozen=True)
+class StackingSettings:
+    """What a run may set; the defaults are the published task.
+
+    Attributes:
+      physics: name of the engine, see `engines.make_engine`.
+      reward_variant: see `rules.tower_reward`.
+      has_shadows: draw the shadows of the two spots; pictures then take about 2.5 times as long.
+      max_actions: actions after which an episode is cut, 1 to 10: a body of the pool for each.
+
+    Raises:
+      ValueError: a value is none of what is allowed.
+    """
+
+    physics: Physics = "auto"
+    reward_variant: RewardVariant = "release"
+    has_shadows: bool = False
+    max_actions: int = scene.NUM_PLACEMENTS
+
+    def __post_init__(self) -> None:
+        for name, allowed in (("physics", PHYSICS), ("reward_variant", REWARD_VARIANTS)):
+            if getattr(self, name) not in allowed:
+                raise ValueError(f"{name}={getattr(self, name)!r} must be one of {allowed}.")
+        if not 1 <= self.max_actions <= scene.NUM_PLACEMENTS:
+            raise ValueError(f"max_actions={self.max_actions} must be 1 to {scene.NUM_PLACEMENTS}.")
+
+
 @struct.dataclass
 class StackingParams:
     """Numbers of the task; traced.
 
     Attributes:
-      max_actions: int32[] actions after which an episode is cut, at most 10: a body of the pool for
-        each.
+      max_actions: int32[] as in `StackingSettings`.
     """
 
-    max_actions: jax.Array | int = scene.NUM_PLACEMENTS
+    max_actions: jax.Array | int = StackingSettings.max_actions
 
 
 @struct.dataclass
@@ -62,7 +91,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     Reward: `rules.tower_reward` at the end of an episode, else 0.
     Ends: `terminated` by a stop, or where the simulation left the finite or plausible numbers, with
       reward 0 then; `truncated` after `max_actions`.
-    Starts: two equal cylinders at rest (spec 3), drawn anew.
+    Starts: two equal cylinders at rest, drawn anew.
     Parameters: `StackingParams`.
     Info: `final_height` f32[] height of the highest origin above the table, m; `max_height` f32[]
       the same, largest of the episode so far; `num_placed`, `num_repeats`, `episode_length` int32[]
@@ -87,34 +116,36 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
 
     def __init__(
         self,
-        physics: str | Engine = "auto",
+        physics: Physics | Engine = StackingSettings.physics,
         position_dim: int = 1,
-        reward_variant: str = "release",
-        has_shadows: bool = False,
+        reward_variant: RewardVariant = StackingSettings.reward_variant,
+        has_shadows: bool = StackingSettings.has_shadows,
+        max_actions: int = StackingSettings.max_actions,
     ) -> None:
-        """
+        """Takes the fields of `StackingSettings`, in place of a name also an engine.
+
         Args:
-          physics: an engine, or its name, see `engines.make_engine`.
-          position_dim: 0, 1 or 2; the camera of 2 looks down on the table (spec 6.1).
-          reward_variant: `release` or `paper`, see `rules.tower_reward`.
-          has_shadows: draw the shadows of the two spots; pictures then take about 2.5 times as
-            long.
+          physics: an engine, or its name.
+          position_dim: 0, 1 or 2; the camera of 2 looks down on the table.
+          reward_variant, has_shadows, max_actions: see `StackingSettings`; the last becomes
+            `default_params`.
 
         Raises:
           ValueError: an argument is none of what is allowed.
         """
         if position_dim not in POSITION_DIMS:
             raise ValueError(f"position_dim={position_dim} must be one of {POSITION_DIMS}.")
-        if reward_variant not in REWARD_VARIANTS:
-            raise ValueError(f"reward_variant={reward_variant!r} must be one of {REWARD_VARIANTS}.")
+        # Of the physics, `engine` tells.
+        self._settings = StackingSettings(
+            reward_variant=reward_variant, has_shadows=has_shadows, max_actions=max_actions
+        )
         self.engine = make_engine(physics) if isinstance(physics, str) else physics
         self.position_dim = position_dim
-        self._reward_variant, self._has_shadows = reward_variant, has_shadows
 
     @property
     def default_params(self) -> StackingParams:
-        """Ten actions."""
-        return StackingParams(jnp.int32(scene.NUM_PLACEMENTS))
+        """As many actions as were set; ten if none were."""
+        return StackingParams(jnp.int32(self._settings.max_actions))
 
     @property
     def action_spec(self) -> ActionSpec:
@@ -133,13 +164,10 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         Raises:
           ValueError: it is not in 1..10.
         """
-        max_actions = int(params.max_actions)
-        if not 1 <= max_actions <= scene.NUM_PLACEMENTS:
-            raise ValueError(f"max_actions={max_actions} must be 1 to {scene.NUM_PLACEMENTS}.")
-        return max_actions
+        return StackingSettings(max_actions=int(params.max_actions)).max_actions
 
     def reset_env(self, key: jax.Array, params: StackingParams) -> tuple[jax.Array, StackingState]:
-        """Two cylinders at rest (spec 3); consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
+        """Two cylinders at rest; consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
         del params
         key_cylinder, key_center, key_gap = jax.random.split(key, 3)
         cylinder = jax.random.choice(key_cylinder, jnp.array(rules.START_CYLINDERS, jnp.int32))
@@ -161,7 +189,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     def step_env(
         self, key: jax.Array, state: StackingState, action: Action, params: StackingParams
     ) -> Transition:
-        """One action and 3 s, without auto-reset (spec 4).
+        """One action and 3 s, without auto-reset.
 
         Args:
           key: not used; nothing is random.
@@ -194,9 +222,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         )
         terminated = stop | ~ok
         truncated = ~terminated & (next_state.num_actions >= params.max_actions)
-        reward = jnp.where(
-            ok & (terminated | truncated), rules.tower_reward(bodies, self._reward_variant), 0.0
-        )
+        reward = rules.tower_reward(bodies, self._settings.reward_variant)
+        reward = jnp.where(ok & (terminated | truncated), reward, 0.0)
         info: Info = {
             "final_height": height,
             "max_height": next_state.max_height,
@@ -240,5 +267,5 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
             bodies.qpos[:num_bodies, :3],
             bodies.qpos[:num_bodies, 3:],
             task_camera(self.position_dim),
-            has_shadows=self._has_shadows,
+            has_shadows=self._settings.has_shadows,
         )

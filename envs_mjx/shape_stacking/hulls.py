@@ -1,4 +1,4 @@
-"""Collision hulls of all classes in one padded format, so that shapes are data (spec 11.2, item 3).
+"""Collision hulls of all classes in one padded format, so that shapes are data.
 
 NumPy only.
 """

@@ -1,4 +1,7 @@
-"""Shape Stacking's play environment: each shape alone, seen from all around (spec 7)."""
+"""Shape Stacking's play environment: each shape alone, seen from all around.
+
+See docs/shape_stacking.md, "Play data".
+"""
 
 from __future__ import annotations
 
@@ -23,7 +26,7 @@ _VIEWS_AT_ONCE_ELSEWHERE = 64
 def viewpoints(
     seed: int, num_recordings: int, num_distinct_views: int = NUM_VIEWS
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Where pictures are taken from, the same for all shapes (spec 7).
+    """Where pictures are taken from, the same for all shapes.
 
     Azimuths are uniform in [0, 2 pi), heights in [0.5, 2.0]. Recording k uses view
     `k % num_distinct_views`, and view k depends on `seed` and k only.

@@ -1,4 +1,4 @@
-"""Where rays enter shapes: closed forms for every solid of the library (spec 11.4).
+"""Where rays enter shapes: closed forms for every solid of the library.
 
 A solid is what lies inside all of its planes and inside one quadric, without an opening (the
 arch), together with two balls (the capsule's ends). P is the number of rays.

@@ -1,11 +1,13 @@
-"""The rules of stacking as pure functions: starts, drops, heights, rewards (spec 3, 4, 5).
+"""The rules of stacking as pure functions: starts, drops, heights, rewards.
 
-All are for one world and may be vmapped.
+All are for one world and may be vmapped. See docs/shape_stacking.md, "Start", "Action" and "Height
+and reward".
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,12 +17,13 @@ from flax import struct
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.shapes import shape_library
 
-# Two copies of one of these stand on the table when an episode starts (spec 3, item 2).
+# Two copies of one of these stand on the table when an episode starts.
 START_CYLINDERS = (798, 799, 800)
 START_CENTER = (-0.2, 0.2)
 START_GAP = (1.0, 1.6)
 
-REWARD_VARIANTS = ("release", "paper")
+RewardVariant = Literal["release", "paper"]
+REWARD_VARIANTS = get_args(RewardVariant)
 
 # A body is dropped so that its bounding sphere overlaps the one below by this much of its scale.
 _OVERLAP = 0.1
@@ -91,7 +94,7 @@ def start(
 
 
 def top(bodies: Bodies) -> jax.Array:
-    """f32[] highest z of a bounding sphere around a centre of mass; 0 with no bodies (spec 4)."""
+    """f32[] highest z of a bounding sphere around a centre of mass; 0 with no bodies."""
     table = jax.tree.map(jnp.asarray, shape_table())
     offsets = _rotated(bodies.qpos[:, 3:], table.center_of_mass[bodies.shape_ids])
     tops = bodies.qpos[:, 2] + offsets[:, 2] + table.bounding_radius[bodies.shape_ids]
@@ -100,7 +103,7 @@ def top(bodies: Bodies) -> jax.Array:
 
 
 def drop_height(bodies: Bodies, shape_id: jax.Array | int) -> jax.Array:
-    """f32[] z at which the origin of a new body of this shape is let go, m (spec 4, item 3)."""
+    """f32[] z at which the origin of a new body of this shape is let go, m."""
     table = jax.tree.map(jnp.asarray, shape_table())
     return top(bodies) + table.bounding_radius[shape_id] - _OVERLAP * table.s[shape_id]
 
@@ -127,7 +130,7 @@ def place(
 
 
 def tower_height(bodies: Bodies) -> jax.Array:
-    """f32[] height of the highest origin above the table, m; 0 with no bodies (spec 5).
+    """f32[] height of the highest origin above the table, m; 0 with no bodies.
 
     It is an origin, not an upper surface: a hat's is in its base.
     """
@@ -137,7 +140,7 @@ def tower_height(bodies: Bodies) -> jax.Array:
 
 
 def tower_reward(bodies: Bodies, variant: str = "release") -> jax.Array:
-    """f32[] reward at the end of an episode: half the tower's height, half a mean (spec 5).
+    """f32[] reward at the end of an episode: half the tower's height, half a mean.
 
     Args:
       bodies: at the end.

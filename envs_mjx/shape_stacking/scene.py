@@ -1,4 +1,4 @@
-"""The physical scene as MJCF text, for both engines (spec shape_stacking 1 and 11.2).
+"""The physical scene as MJCF text, for both engines (docs/shape_stacking.md, "World").
 
 A plane, and a pool of free bodies whose geometry is data: each engine says what a body of the pool
 holds. Positions are metres, angles radians, masses kilograms. Text and NumPy only.
@@ -15,7 +15,7 @@ import numpy as np
 from envs_mjx.shape_stacking.shapes import shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES, solids
 
-# Two start cylinders and ten placements (spec 11.2, item 1).
+# Two start cylinders and ten placements.
 NUM_START_CYLINDERS = 2
 NUM_PLACEMENTS = 10
 NUM_SLOTS = NUM_START_CYLINDERS + NUM_PLACEMENTS
@@ -25,15 +25,15 @@ TIMESTEP_S = 0.01
 SETTLE_STEPS = 300
 GRAVITY = (0.0, 0.0, -9.81)
 
-# Sliding, torsional and rolling friction of every contact (spec 1). The plane carries them too, so
-# that they do not hang on how an engine combines two geoms (spec 12, item 17).
+# Sliding, torsional and rolling friction of every contact. The plane carries them too, so that
+# they do not hang on how an engine combines two geoms.
 FRICTION = (2.0, 2.0, 0.25)
 CONDIM = 6
 SOLREF = (0.02, 1.0)
 SOLIMP = (0.9, 0.95, 0.001, 0.5, 2.0)
 
-# Unused bodies wait here, high and far apart: in 3 s they fall 44 m and touch nothing (spec 11.2,
-# item 6). Below the table they would count as deep contacts.
+# Unused bodies wait here, high and far apart: in 3 s they fall 44 m and touch nothing. Below
+# the table they would count as deep contacts.
 PARKING_X = 20.0
 PARKING_GAP = 3.0
 PARKING_HEIGHT = 100.0
@@ -43,7 +43,7 @@ PRIMITIVES = ("sphere", "capsule", "cylinder")
 
 @dataclass(frozen=True)
 class Solver:
-    """How contact forces are found; the defaults are those of spec 1.
+    """How contact forces are found; the defaults are the original's.
 
     Attributes:
       iterations, ls_iterations: upper bounds of Newton's steps and of its line searches.
@@ -111,7 +111,7 @@ def scene_text(
     Args:
       bodies: of `body_text`.
       assets: of `hull_text`.
-      solver: its limits; None for those of spec 1.
+      solver: its limits; None for the original's.
       extra: elements of an engine's own, such as `<custom>` or `<size>`.
     """
     solver = solver or Solver()
@@ -163,7 +163,7 @@ def geom_text(form: Form) -> str:
     """What a form collides with, in the axes of its body: a primitive, or the mesh of its name."""
     if form.kind == "mesh":
         return f'<geom type="mesh" mesh="{form.name}"/>'
-    # Radius 1 and half-length 1 at s = 1 (spec 2.2); a sphere has no length.
+    # Radius 1 and half-length 1 at s = 1; a sphere has no length.
     size = [form.s] if form.kind == "sphere" else [form.s, form.s]
     return f'<geom type="{form.kind}" size="{_text(size)}"/>'
 

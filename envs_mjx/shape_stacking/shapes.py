@@ -1,6 +1,6 @@
-"""The 810 shapes: sixteen solids in many sizes, turned about the vertical (spec shape_stacking 2).
+"""The 810 shapes: sixteen solids in many sizes, turned about the vertical.
 
-NumPy only.
+See docs/shape_stacking.md, "Ids", "Solids", "Radius and mass". NumPy only.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class _Family:
     num_angles: int = 1
 
 
-# In the order of `CLASS_NAMES` (spec 2.1).
+# In the order of `CLASS_NAMES`.
 _FAMILIES = (
     _Family((0.1, 0.5), 6, math.pi, 10),
     _Family((0.1, 0.5), 6, math.pi, 10),
@@ -66,7 +66,7 @@ _FAMILIES = (
 
 @dataclass(frozen=True)
 class ShapeLibrary:
-    """All shapes in the canonical order of ids (spec 2.1), A = 810.
+    """All shapes in the canonical order of ids, A = 810.
 
     A shape's axes are those of its body before its yaw: put its body at rotation `quaternion`.
     Heights, centres and inertias are in these axes; lengths are metres, masses kilograms.
@@ -74,18 +74,18 @@ class ShapeLibrary:
     Attributes:
       class_labels: int32[A] index into `solids.CLASS_NAMES`.
       scale_index: int32[A] index into the class's list of scales.
-      s: f64[A] final scale: everything of spec 2.2 is multiplied by it.
+      s: f64[A] final scale: every length at s = 1 is multiplied by it.
       yaw: f64[A] rotation about the vertical, rad.
       quaternion: f64[A, 4] the same as (w, x, y, z).
       color: f64[A, 3] RGB in [0, 1].
       base, top: f64[A] lowest and highest z relative to the origin.
       volume: f64[A] of the true solid, m^3.
       center_of_mass: f64[A, 3] of the true solid, relative to the origin.
-      mass: f64[A] 1000 kg/m^3 times the volume (spec 12, item 11), the arch's without its opening.
+      mass: f64[A] 1000 kg/m^3 times the volume, the arch's without its opening.
       inertia: f64[A, 3, 3] about the centre of mass, kg m^2.
       principal_inertia: f64[A, 3] its eigenvalues, largest first.
       principal_quaternion: f64[A, 4] (w, x, y, z) rotation of the principal axes.
-      bounding_radius: f64[A] what the drop rule adds to heights (spec 2.3, column C4, times s).
+      bounding_radius: f64[A] what the drop rule adds to heights.
       hulls: the collision hull of each class at s = 1.
     """
 
@@ -154,9 +154,9 @@ def shape_universe() -> ActionUniverse:
     """All shapes as an action universe.
 
     The primary parameter is the scale s in metres. The content is class, s, yaw and colour,
-    f32[810, 6]. `cone-hires` and `cone` are the same solid (spec 2.2): equal scales of the two are
-    shapes that differ in colour only, and the published splits part some of these pairs.
-    Engineered vector (spec 8):
+    f32[810, 6]. `cone-hires` and `cone` are the same solid: equal scales of the two are shapes
+    that differ in colour only, and the published splits part some of these pairs.
+    Engineered vector:
 
     * `gt21` f32[810, 21]: s, the axis of the rotation (0, 0, 1), its angle in radians, and the
       class as one-hot in the order of `solids.CLASS_NAMES`.
@@ -189,7 +189,7 @@ def _enumerate() -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
 
 
 def _colors() -> np.ndarray:
-    """f64[A, 3] RGB; five draws per shape in the order of ids (spec 2.1)."""
+    """f64[A, 3] RGB; five draws per shape in the order of ids."""
     draws = np.random.RandomState(_COLOR_SEED).uniform(_DRAW_LOW, _DRAW_HIGH, (NUM_SHAPES, 5))
     return np.array([colorsys.hsv_to_rgb(*row) for row in draws[:, :3]])
 

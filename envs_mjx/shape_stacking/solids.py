@@ -1,6 +1,7 @@
-"""The sixteen classes of shapes at s = 1: what each is, before scale and yaw (spec 2.2, 2.3).
+"""The sixteen classes of shapes at s = 1: what each is, before scale and yaw.
 
-Axes are a shape's own, the origin is its body's position, lengths are metres. NumPy only.
+Axes are a shape's own, the origin is its body's position, lengths are metres. NumPy only. See
+docs/shape_stacking.md, "Solids".
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from envs_mjx.shape_stacking import moments
 from envs_mjx.shape_stacking.moments import Moments
 from envs_mjx.shape_stacking.polyhedra import Polyhedron, box, prism, pyramid
 
-# The order of the machine that wrote the published splits (spec 2.1, class order trap).
+# The order of the machine that wrote the published splits (docs/shape_stacking.md, "Ids").
 CLASS_NAMES = (
     "middle_triangle",
     "hat",
@@ -56,7 +57,7 @@ _WEDGES = {
     "tall_triangle": ([(-1.0, -2.0), (1.0, -2.0), (-1.0, 2.0)], 1),
 }
 _SQUARE = [(-1.0, -1.0), (1.0, -1.0), (1.0, 1.0), (-1.0, 1.0)]
-# Column C4 of spec 2.3: what the engine finds for the original meshes.
+# What MuJoCo 4.0 finds for the original meshes.
 _BOUNDING_RADII = {
     "middle_triangle": 1.943,
     "hat": 1.969,
@@ -85,8 +86,8 @@ class Solid:
     Attributes:
       name: of `CLASS_NAMES`.
       base, top: lowest and highest z.
-      bounding_radius: what the drop rule adds to heights (spec 2.3, C4); a constant of the
-        original meshes, not of this solid.
+      bounding_radius: what the drop rule adds to heights; a constant of the original
+        meshes, not of this solid.
       moments: of the true solid. Round sides are round, and the arch has its opening.
       hull: what the physics collides: the convex hull, flat-sided (12-gons of equal area for
         cylinder and cone, 8 chords for the dome's arc), a full box for the arch. None for sphere
@@ -161,7 +162,7 @@ def _moments(name: str, hull: Polyhedron | None) -> Moments:
 def _equal_area_polygon() -> np.ndarray:
     """f64[12, 2] corners of the regular 12-gon with the area of the unit circle.
 
-    Its area is 6 R^2 sin(30 degrees) = 3 R^2, so R = sqrt(pi / 3) = 1.023 (spec 11.2, item 3).
+    Its area is 6 R^2 sin(30 degrees) = 3 R^2, so R = sqrt(pi / 3) = 1.023.
     """
     angles = 2.0 * np.pi * np.arange(_ROUND_SEGMENTS) / _ROUND_SEGMENTS
     return np.sqrt(np.pi / 3.0) * np.stack([np.cos(angles), np.sin(angles)], axis=-1)

@@ -1,4 +1,4 @@
-"""Which shapes are trained with and which are new (spec shape_stacking 9). NumPy only."""
+"""Which shapes are trained with and which are new: docs/shape_stacking.md, "Splits". NumPy only."""
 
 from __future__ import annotations
 
@@ -46,11 +46,11 @@ _HALVES_SEED = 41
 
 @lru_cache(maxsize=2)
 def published_split(name: str = "default") -> ActionSplit:
-    """A split with the published training shapes (spec 9).
+    """A split with the published training shapes.
 
-    What is held out is cut in two as the original does it (spec method 2.1): shuffled with
-    `RandomState(41)`, the first half is for validation. The order that the original shuffled from
-    is not known; here it is that of the ids, so that the members of the two halves are ours.
+    What is held out is cut in two as the original does it: shuffled with `RandomState(41)`, the
+    first half is for validation. The order that the original shuffled from is not known; here it is
+    that of the ids, so that the members of the two halves are ours.
 
     Args:
       name: "default" (405 / 202 / 203 shapes; train and evaluation differ by scale within each

@@ -1,4 +1,4 @@
-"""An interactive page of a tower: Brax's viewer with the shapes of the library (spec 2).
+"""An interactive page of a tower: Brax's viewer with the shapes of the library.
 
 Lengths are metres. Imports Brax, by its adapter.
 """
@@ -13,12 +13,9 @@ import numpy as np
 
 from envs_mjx import brax_adapter
 from envs_mjx.shape_stacking import scene
+from envs_mjx.shape_stacking.camera import TABLE_COLOR, TABLE_HALF_SIZES
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, shape_library
 from envs_mjx.shape_stacking.solids import ARCH_OPENING_RADIUS, CLASS_NAMES, solids
-
-# The table as it is drawn (spec 1): half-sizes along x and y.
-TABLE_HALF_SIZES = (4.0, 2.0)
-TABLE_COLOR = (0.9, 0.9, 0.9)
 
 # Where a body waits for its first frame: above its first place, beyond the viewer's fog (60 m).
 WAITING_HEIGHT = 70.0
@@ -87,7 +84,7 @@ def body_geom(shape_id: int) -> Geom:
         "pos": [0.0, 0.0, 0.0],
         "rot": [1.0, 0.0, 0.0, 0.0],
         "rgba": [*color.tolist(), 1.0],
-        # Radius 1 and half-length 1 at s = 1 (spec 2.2).
+        # Radius 1 and half-length 1 at s = 1.
         "size": [form.s, 0.0 if form.kind == "sphere" else form.s, 0.0],
     }
     if form.kind == "mesh":
@@ -128,7 +125,7 @@ def _table() -> Geom:
         "link_idx": -1,
         "pos": [0.0, 0.0, scene.TABLE_HEIGHT],
         "rot": [1.0, 0.0, 0.0, 0.0],
-        "rgba": [*TABLE_COLOR, 1.0],
+        "rgba": [*[TABLE_COLOR] * 3, 1.0],
         "size": [2.0 * x, 2.0 * y, 1.0],
     }
 
@@ -152,7 +149,7 @@ def _polygons(class_label: int) -> list[np.ndarray]:
 
 
 def _arch() -> list[np.ndarray]:
-    """The box (2, 1, 1) with its opening (spec 2.2), cut into columns along x.
+    """The box (2, 1, 1) with its opening, cut into columns along x.
 
     The opening is drawn with 32 chords, which make it 0.2 % smaller.
     """

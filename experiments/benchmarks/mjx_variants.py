@@ -22,9 +22,10 @@ import numpy as np
 from absl import flags
 
 from envs_mjx.shape_stacking import hulls, rules, scene, shape_library
-from envs_mjx.shape_stacking.engines import Settled, _mjx_pool
-from envs_mjx.shape_stacking.engines._hull_contacts import APART
+from envs_mjx.shape_stacking.engines import Settled
+from envs_mjx.shape_stacking.engines import mjx_pool as _mjx_pool
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts
+from envs_mjx.shape_stacking.engines.hull_contacts import APART
 from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.polyhedra import Polyhedron, prism, pyramid

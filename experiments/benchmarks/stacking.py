@@ -23,8 +23,8 @@ from jax.experimental.compilation_cache import compilation_cache
 
 from envs_mjx.shape_stacking import rules, scene
 from envs_mjx.shape_stacking.engines import Engine, make_engine
-from envs_mjx.shape_stacking.engines._mujoco_pool import world_model
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+from envs_mjx.shape_stacking.engines.mujoco_pool import world_model
 from envs_mjx.shape_stacking.rules import Bodies
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from experiments.benchmarks import _measure as m

@@ -8,7 +8,8 @@ import pytest
 from scipy.spatial import ConvexHull
 
 from envs_mjx.shape_stacking import scene, shape_library
-from envs_mjx.shape_stacking.engines import Settled, _mjx_pool
+from envs_mjx.shape_stacking.engines import Settled
+from envs_mjx.shape_stacking.engines import mjx_pool as _mjx_pool
 from experiments.benchmarks import mjx_variants as variants
 
 

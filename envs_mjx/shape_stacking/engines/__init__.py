@@ -1,21 +1,22 @@
-"""Engines: what happens to the bodies in the 3 s after an action (spec shape_stacking 4, item 4).
+"""Engines: what happens to the bodies in the 3 s after an action.
 
 `make_engine` makes one by its name. Each is a module of its own, since simulators take long to
-import.
+import. See docs/shape_stacking.md, "Engines".
 """
 
 from __future__ import annotations
 
 from functools import lru_cache
-from typing import Any
+from typing import Any, Literal, get_args
 
 import jax
 
-from envs_mjx.shape_stacking.engines._contract import Engine, Settled, check_state
+from envs_mjx.shape_stacking.engines.contract import Engine, Settled, check_state
 
-__all__ = ["PHYSICS", "Engine", "Settled", "check_state", "make_engine"]
+__all__ = ["PHYSICS", "Engine", "Physics", "Settled", "check_state", "make_engine"]
 
-PHYSICS = ("auto", "mjx", "mujoco")
+Physics = Literal["auto", "mjx", "mujoco"]
+PHYSICS = get_args(Physics)
 
 
 @lru_cache(maxsize=4)

@@ -1,7 +1,7 @@
 """Everything of mujoco-mjx that has no public name, and the versions that have it.
 
 MJX moves the bodies and solves for the contact forces. Where bodies touch is found by this
-project's own code, since MJX wants shapes to be part of the program (spec shape_stacking 11.1);
+project's own code, since MJX wants shapes to be part of the program;
 `_impl.contact` of MJX's data is where the two meet. Nothing of MJX is replaced or patched.
 """
 

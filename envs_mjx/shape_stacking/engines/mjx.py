@@ -1,4 +1,4 @@
-"""MJX's JAX backend: inside the program, on any device; shapes are data (spec 11.2)."""
+"""MJX's JAX backend: inside the program, on any device; shapes are data."""
 
 from __future__ import annotations
 
@@ -11,16 +11,15 @@ import jax.numpy as jnp
 import mujoco
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines import _mjx_pool, _mjx_private
-from envs_mjx.shape_stacking.engines._contract import Settled, check_state
-from envs_mjx.shape_stacking.engines._limits import is_plausible
-from envs_mjx.shape_stacking.engines._mjx_pool import Limits
+from envs_mjx.shape_stacking.engines import _mjx_private, mjx_pool
+from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 
 # Line searches always take all their steps here. With 8 and 12 towers end no nearer to C's; with 2
-# and 3 a cube that tips off an edge ends 5 cm from where it should (spec 13, check 14):
-# results/shape_stacking/mjx_speed.md.
+# and 3 a cube that tips off an edge ends 5 cm from where it should (docs/shape_stacking.md,
+# "Reference figures", 14): results/shape_stacking/mjx_speed.md.
 SOLVER = scene.Solver(iterations=3, ls_iterations=5)
 MAX_CONTACTS = 48
 
@@ -56,7 +55,7 @@ class Mjx:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's (spec 4).
+          settle_steps: at least 1; 300 is the task's.
           num_slots: 2 to 12. Arrays have 12 rows whatever it is; with fewer slots, which is
             cheaper, worlds that use a body beyond them are not `ok`.
           max_contacts: points of contact in a world, at least 1; the deepest are kept.
@@ -118,9 +117,9 @@ class Mjx:
         """One world from a cold start; arrays [num_slots, ...]."""
         step = partial(
             _step,
-            _mjx_pool.with_shapes(self._model, shape_ids),
+            mjx_pool.with_shapes(self._model, shape_ids),
             self._data,
-            _mjx_pool.pool(shape_ids),
+            mjx_pool.pool(shape_ids),
             self._limits,
         )
         start = (qpos.ravel(), qvel.ravel(), jnp.zeros(qvel.size))
@@ -131,11 +130,11 @@ class Mjx:
 _State = tuple[jax.Array, jax.Array, jax.Array]
 
 
-def _step(model: Any, data: Any, pool: _mjx_pool.Pool, limits: Limits, state: _State) -> _State:
+def _step(model: Any, data: Any, pool: mjx_pool.Pool, limits: Limits, state: _State) -> _State:
     """One physics step of qpos, qvel and the last accelerations, flat."""
 
     def find(data: Any) -> _mjx_private.Contacts:
-        return _mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
+        return mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
 
     qpos, qvel, acceleration = state
     data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=acceleration)

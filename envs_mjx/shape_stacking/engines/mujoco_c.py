@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines._contract import Settled, check_state
-from envs_mjx.shape_stacking.engines._limits import is_plausible
-from envs_mjx.shape_stacking.engines._mujoco_pool import Worlds
+from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from jaxnew.cores import available_cores
@@ -30,8 +29,8 @@ class MujocoC:
 
     Spheres, capsules and cylinders collide as such, all other shapes by the hulls of the library
     (`solids.Solid.hull`). Two hulls touch in one point, as in the engine of the paper's runs, whose
-    towers creep for that (spec 10): the figures of spec 13 are those of one point. On the table a
-    hull stands on up to four in either case.
+    towers creep for that: docs/shape_stacking.md, "Reference figures", are those of one point. On
+    the table a hull stands on up to four in either case.
 
     Numbers are f64 inside. On one machine a world's result is the same bits for every batch size,
     order of worlds and number of threads.
@@ -52,7 +51,7 @@ class MujocoC:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's (spec 4).
+          settle_steps: at least 1; 300 is the task's.
           num_threads: 0 for one per core that this process may use.
           has_multiple_contacts: two hulls touch in several points where their faces or edges lie
             on each other, as in MuJoCo's present defaults and much as in MJX: steadier towers.
