@@ -85,8 +85,8 @@ def quadrant_of(displacement: np.ndarray) -> np.ndarray:
 
     Every quadrant holds the half-axis at its start, turning clockwise on the screen from due east:
     due east counts as south-east, due south as south-west, and so on. Only a rule that turns with
-    the grid gives 256 skills to each. (The release's figures swap the arrow
-    glyphs of the second and the fourth quadrant; these labels are the right ones.)
+    the grid gives 256 skills to each. (The release's figures swap the arrow glyphs of the second
+    and the fourth quadrant; these labels are the right ones.)
 
     Args:
       displacement: integer[..., 2] (dx, dy), not (0, 0); y grows downwards.

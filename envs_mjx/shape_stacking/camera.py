@@ -14,14 +14,15 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking.rays import Bodies, Hits, Vector, dot, nearest, normals, walk
+from envs_mjx.shape_stacking.scene import TABLE_HEIGHT
 from envs_mjx.shape_stacking.shapes import shape_library
 
 FRAME_SIZE = 84
-TABLE_HEIGHT = -0.5
+# The table as it is drawn: half-sizes along x and y, m, and gray.
+TABLE_HALF_SIZES = (4.0, 2.0)
+TABLE_COLOR = 0.9
 
 _FIELD_OF_VIEW = math.radians(45.0)
-_TABLE_HALF_SIZES = (4.0, 2.0)
-_TABLE_COLOR = 0.9
 _EMISSION = 0.25
 _AMBIENT = 0.1
 _HEADLIGHT = 0.4
@@ -164,7 +165,7 @@ def render_rgb(
     points = walk(origin, jnp.where(jnp.isfinite(hits.distance), hits.distance, 0.0), directions)
     light = _light(bodies, hits, points, camera, has_shadows)
     colors = jnp.asarray(library.color, jnp.float32)[ids]
-    color = jnp.where(hits.surface[:, None] < 0, _TABLE_COLOR, colors[hits.body])
+    color = jnp.where(hits.surface[:, None] < 0, TABLE_COLOR, colors[hits.body])
     light = jnp.where(jnp.isfinite(hits.distance), light, 0.0)
     picture = jnp.clip(color * light[:, None], 0.0, 1.0)
     return jnp.round(255.0 * picture).astype(jnp.uint8).reshape(size, size, 3)
@@ -219,7 +220,7 @@ def _table_distance(origin: Vector, directions: Vector, has_table: bool) -> jax.
     distance = (TABLE_HEIGHT - origin[2]) / jnp.where(is_down, directions[2], -1.0)
     x, y, _ = walk(origin, distance, directions)
     is_met = is_down & (distance > 0.0)
-    is_met &= (jnp.abs(x) <= _TABLE_HALF_SIZES[0]) & (jnp.abs(y) <= _TABLE_HALF_SIZES[1])
+    is_met &= (jnp.abs(x) <= TABLE_HALF_SIZES[0]) & (jnp.abs(y) <= TABLE_HALF_SIZES[1])
     return jnp.where(is_met, distance, nowhere)
 
 

@@ -154,8 +154,8 @@ def shape_universe() -> ActionUniverse:
     """All shapes as an action universe.
 
     The primary parameter is the scale s in metres. The content is class, s, yaw and colour,
-    f32[810, 6]. `cone-hires` and `cone` are the same solid: equal scales of the two are
-    shapes that differ in colour only, and the published splits part some of these pairs.
+    f32[810, 6]. `cone-hires` and `cone` are the same solid: equal scales of the two are shapes
+    that differ in colour only, and the published splits part some of these pairs.
     Engineered vector:
 
     * `gt21` f32[810, 21]: s, the axis of the rotation (0, 0, 1), its angle in radians, and the

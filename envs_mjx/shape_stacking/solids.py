@@ -86,8 +86,8 @@ class Solid:
     Attributes:
       name: of `CLASS_NAMES`.
       base, top: lowest and highest z.
-      bounding_radius: what the drop rule adds to heights; a constant of the
-        original meshes, not of this solid.
+      bounding_radius: what the drop rule adds to heights; a constant of the original
+        meshes, not of this solid.
       moments: of the true solid. Round sides are round, and the arch has its opening.
       hull: what the physics collides: the convex hull, flat-sided (12-gons of equal area for
         cylinder and cone, 8 chords for the dome's arc), a full box for the arch. None for sphere

@@ -48,9 +48,9 @@ _HALVES_SEED = 41
 def published_split(name: str = "default") -> ActionSplit:
     """A split with the published training shapes.
 
-    What is held out is cut in two as the original does it: shuffled with
-    `RandomState(41)`, the first half is for validation. The order that the original shuffled from
-    is not known; here it is that of the ids, so that the members of the two halves are ours.
+    What is held out is cut in two as the original does it: shuffled with `RandomState(41)`, the
+    first half is for validation. The order that the original shuffled from is not known; here it is
+    that of the ids, so that the members of the two halves are ours.
 
     Args:
       name: "default" (405 / 202 / 203 shapes; train and evaluation differ by scale within each

@@ -13,12 +13,9 @@ import numpy as np
 
 from envs_mjx import brax_adapter
 from envs_mjx.shape_stacking import scene
+from envs_mjx.shape_stacking.camera import TABLE_COLOR, TABLE_HALF_SIZES
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, shape_library
 from envs_mjx.shape_stacking.solids import ARCH_OPENING_RADIUS, CLASS_NAMES, solids
-
-# The table as it is drawn: half-sizes along x and y.
-TABLE_HALF_SIZES = (4.0, 2.0)
-TABLE_COLOR = (0.9, 0.9, 0.9)
 
 # Where a body waits for its first frame: above its first place, beyond the viewer's fog (60 m).
 WAITING_HEIGHT = 70.0
@@ -128,7 +125,7 @@ def _table() -> Geom:
         "link_idx": -1,
         "pos": [0.0, 0.0, scene.TABLE_HEIGHT],
         "rot": [1.0, 0.0, 0.0, 0.0],
-        "rgba": [*TABLE_COLOR, 1.0],
+        "rgba": [*[TABLE_COLOR] * 3, 1.0],
         "size": [2.0 * x, 2.0 * y, 1.0],
     }
 

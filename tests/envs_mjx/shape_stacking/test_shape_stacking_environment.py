@@ -134,6 +134,14 @@ def test_variants_of_placement(
     assert (picture > 0).sum() > 500
 
 
+def test_shadows_can_be_drawn() -> None:
+    bodies = rules.start(799, 0.0, 1.3)
+    dark, lit = (
+        ShapeStacking(Recorder(), has_shadows=on).start_from(bodies)[0] for on in (True, False)
+    )
+    assert lit.mean() - dark.mean() > 0.01  # Of the four frames, of which three are black.
+
+
 def test_ten_actions_are_the_limit() -> None:
     state = started(STILL)
     for k in range(10):
