@@ -67,13 +67,13 @@ class DrawEpisode(Protocol):
       size: pixels of the frames' height, about.
     """
 
-    def __call__(self, environment: Any, episode: Episode, *, size: int) -> Film: ...
+    def __call__(self, environment: Any, episode: Episode, /, *, size: int) -> Film: ...
 
 
 class MakePage(Protocol):
     """An episode as an interactive page; returns HTML."""
 
-    def __call__(self, environment: Any, episode: Episode) -> str: ...
+    def __call__(self, environment: Any, episode: Episode, /) -> str: ...
 
 
 @dataclass(frozen=True)
