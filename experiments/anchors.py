@@ -1,101 +1,87 @@
-"""What policies without training reach: anchors for the results.
+"""What policies without training reach: anchors for the results of a task that has some.
 
     python -m experiments.anchors --sets=train,test --set_sizes=50,500
     python -m experiments.anchors --task=shape_stacking --sets=train,validation,test --episodes=500
 
-Of the Recommender, those that know products and tastes; of Shape Stacking (and of
-`shape_stacking-no-place` and `shape_stacking-2d-place`), stopping, random play and a script. The
-anchors of Shape Stacking are kept beside its runs, where `figures` finds them.
+They play the episodes of `evaluate`. The numbers are kept beside the task's runs, where `figures`
+finds them.
 """
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
-from absl import flags
+from experiments.flags import Arguments
+from experiments.reports.anchors import FOLDER, Anchors, Line, table_row
+from jaxnew.storage import config as config_lib
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError, load_place
 
-from experiments.pipeline import flags as flag
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.training import EVALUATION_SEED
-from experiments.reports.anchors import FOLDER, Anchors, Summary, table_header, table_row
-
-_STACKING = "shape_stacking"
-
-
-def define_flags() -> None:
-    """Flags of the command; not at import, since other commands have flags of these names."""
-    flags.DEFINE_list("sets", ["train", "test"], "Parts of the split.")
-    flags.DEFINE_list("set_sizes", [], "Actions in a set; default: 50,500, or as in training.")
-    flags.DEFINE_integer("episodes", 0, "Episodes of each anchor; 0: 5000, or 500 of stacking.")
-    flags.DEFINE_string("physics", "auto", "Engine that stacks; see engines.make_engine.")
-    flags.DEFINE_string("out", None, "Folder of the file; default: anchors/ beside the runs.")
-    flags.set_default(flag.TASK, "recommender")
+ARGUMENTS = Arguments(__doc__, "split", "split_seed", "runs")
+ARGUMENTS.define("string", "task", "recommender", "Task name, or package.module:TASK.")
+ARGUMENTS.define("list", "sets", ["train", "test"], "Parts of the split.")
+ARGUMENTS.define("list", "set_sizes", [], "Actions in a set; default: the task's own choice.")
+ARGUMENTS.define("integer", "episodes", 0, "Of each anchor; 0: the task's own choice.")
+ARGUMENTS.define("string", "out", None, "Folder of the files; default: anchors/ beside the runs.")
+ARGUMENTS.define("multi_string", "set", [], "environment.FIELD=value, settings of the environment.")
 
 
 def main() -> None:
-    values = flags.FLAGS
-    task = flag.load_task(flag.TASK.value)
-    sizes = [int(size) for size in values.set_sizes]
-    if task.name == "recommender":
-        domain = Domain.of(task, flag.SPLIT.value)
-        recommend(domain, values.sets, sizes, values.episodes)
-    elif task.actions_name == _STACKING:
-        domain = Domain.of(task, flag.SPLIT.value)
-        default = Path(flag.RUNS.value) / task.name / FOLDER
-        out = Path(values.out) if values.out else default
-        print(stack(domain, values.physics, values.sets, sizes, values.episodes, out))
-    else:
-        raise flag.UsageError(
-            f"Task {task.name} has no anchors; there are those of recommender and {_STACKING}."
-        )
+    domain = Domain.of(load_task(ARGUMENTS.task), ARGUMENTS.split, ARGUMENTS.split_seed)
+    out = Path(ARGUMENTS.out or domain.folder(Path(ARGUMENTS.runs)) / FOLDER)
+    try:
+        sizes = [int(size) for size in ARGUMENTS.set_sizes]
+    except ValueError as err:
+        raise UsageError(f"--set_sizes must be numbers separated by commas: {err}.") from err
+    for file in measure_anchors(
+        domain, ARGUMENTS.sets, sizes, ARGUMENTS.episodes, out, ARGUMENTS.set
+    ):
+        print(file)
 
 
-def recommend(domain: Domain, parts: list[str], sizes: list[int], episodes: int) -> None:
-    """Prints the anchors of the Recommender."""
-    from experiments.untrained import recommender
-
-    sizes, episodes = sizes or list(recommender.SET_SIZES), episodes or recommender.EPISODES
-    for line in recommender.lines(domain, parts, sizes, episodes):
-        print(line, flush=True)
-
-
-def stack(
-    domain: Domain, physics: str, parts: list[str], sizes: list[int], episodes: int, out: Path
-) -> Path:
-    """Prints the anchors of a variant of Shape Stacking and keeps them.
+def measure_anchors(
+    domain: Domain,
+    parts: list[str],
+    sizes: list[int],
+    episodes: int,
+    out: Path,
+    assignments: config_lib.Assignments = (),
+) -> list[Path]:
+    """Prints the anchors of a task, and keeps them in a file for each size of sets.
 
     Args:
-      physics: see `engines.make_engine`.
+      domain: the task and its split.
       parts: of the split.
-      sizes: none for sets as in training, or one.
-      episodes: of each; 0 for the default.
-      out: folder of the file, which is written anew after every line.
-
-    Returns:
-      The file.
+      sizes: of sets; none for the task's own choice.
+      episodes: of each anchor on each part; 0 likewise.
+      out: folder of the files, which are written anew after every line.
+      assignments: `environment.FIELD`, settings of the environment.
 
     Raises:
-      UsageError: several sizes.
+      UsageError: the task has no anchors.
+      ConfigError: there is no such setting, or it takes no such value.
     """
-    from envs_mjx.shape_stacking.engines import make_engine
-    from experiments.untrained import stacking
-
-    if len(sizes) > 1:
-        raise flag.UsageError(f"A file of anchors has sets of one size; got {sizes}.")
-    engine = make_engine(physics)
-    size = sizes[0] if sizes else domain.task.stage_two["paper"].ppo.rollout.set_size
-    episodes = episodes or stacking.EPISODES
-    print("\n".join(table_header(stacking.METRICS)), flush=True)
-    found: dict[str, dict[str, Summary]] = {}
-    path = out
-    for policy, part, summary in stacking.summaries(domain, engine, parts, size, episodes):
-        print(table_row(policy, part, summary), flush=True)
-        found.setdefault(policy, {})[part] = summary
-        names = domain.task.name, domain.split_name, engine.name
-        path = Anchors(*names, size, episodes, EVALUATION_SEED, found).save(out)
-    return path
+    task = domain.task
+    if task.shown.anchors is None:
+        raise UsageError(f"Task {task.name} has no policies without training to measure.")
+    measure = load_place(task.shown.anchors, f"anchors of {task.name}", "See Task.shown.anchors.")
+    config_type = dataclasses.make_dataclass(
+        "AnchorConfig", [("environment", type(task.environment))], frozen=True
+    )
+    settings = config_lib.set_paths(config_type(task.environment), assignments).environment
+    found: dict[int, Anchors] = {}
+    line: Line
+    for line in measure(domain, parts, sizes, episodes, settings):
+        if line.set_size not in found:
+            found[line.set_size] = Anchors.of(domain, settings, line)
+            print("\n".join(found[line.set_size].heading(list(line.summary))))
+        anchors = found[line.set_size]
+        anchors.values.setdefault(line.policy, {})[line.part] = line.summary
+        print(table_row(line.policy, line.part, line.summary), flush=True)
+        anchors.save(out)
+    return [anchors.path(out) for anchors in found.values()]
 
 
 if __name__ == "__main__":
-    define_flags()
-    flag.run_command(main)
+    ARGUMENTS.start(main)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
-from experiments.pipeline.flags import UsageError
 from experiments.reports.plots import Metric
-from experiments.reports.runs import Group
+from jaxnew.evaluation import EVALUATION_SEED
+from jaxnew.storage import config as config_lib
+from jaxnew.task.domain import Domain
+from jaxnew.task.places import UsageError
+from jaxnew.task.task import Task
+
+if TYPE_CHECKING:
+    from experiments.reports.runs import Group
 
 FOLDER = "anchors"  # Beside the runs of the task.
 
@@ -18,9 +24,30 @@ FOLDER = "anchors"  # Beside the runs of the task.
 Summary = Mapping[str, Mapping[str, Any]]
 
 
+class Line(NamedTuple):
+    """One policy on one part of the split: what `Presentation.anchors` yields.
+
+    It is called with a `Domain`, parts of the split, set sizes and a number of episodes (none and 0
+    for its own choice), and settings of the environment.
+
+    Attributes:
+      policy, part: which.
+      set_size, num_episodes: what was played.
+      engine: that simulated, empty where there is one only.
+      summary: the metrics that count.
+    """
+
+    policy: str
+    part: str
+    set_size: int
+    num_episodes: int
+    engine: str
+    summary: Summary
+
+
 @dataclass(frozen=True)
 class Anchors:
-    """The anchors of one task on one split and one engine.
+    """The anchors of one task on one split, one engine and sets of one size.
 
     Attributes:
       task, split, engine: their names.
@@ -28,6 +55,8 @@ class Anchors:
       num_episodes: of every policy on every part of the split.
       seed: of the episodes, which are those of `evaluate`.
       values: by policy and part of the split.
+      split_seed: of the split.
+      environment: settings that are not the task's.
     """
 
     task: str
@@ -36,12 +65,28 @@ class Anchors:
     set_size: int
     num_episodes: int
     seed: int
-    values: Mapping[str, Mapping[str, Summary]]
+    values: dict[str, dict[str, Summary]]
+    split_seed: int = 0
+    environment: Mapping[str, Any] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, domain: Domain, settings: Any, line: Line) -> Anchors:
+        """Those that a line belongs to, still without values."""
+        changed = changed_settings(domain.task, config_lib.plain(settings))
+        size, episodes, split = line.set_size, line.num_episodes, domain.split_name
+        names = domain.task.name, split, line.engine
+        return cls(*names, size, episodes, EVALUATION_SEED, {}, domain.split_seed, changed)
+
+    def path(self, folder: Path) -> Path:
+        """Their file in a folder."""
+        words = [self.split, f"split{self.split_seed}" * bool(self.split_seed), self.engine]
+        words += [f"{name}={value}" for name, value in self.environment.items()]
+        return folder / f"{'-'.join(filter(None, words))}-m{self.set_size}.json"
 
     def save(self, folder: Path) -> Path:
-        """Writes them into a folder, in place of those of the same split and engine."""
+        """Writes them into a folder, in place of those that are like them."""
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / f"{self.split}-{self.engine}.json"
+        path = self.path(folder)
         path.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
         return path
 
@@ -59,41 +104,61 @@ class Anchors:
                 f"{path} is damaged ({err}); delete it, and make it anew with experiments.anchors."
             ) from err
 
+    def heading(self, metrics: Sequence[str]) -> list[str]:
+        """What they are, and the head of their table."""
+        engine = f", engine {self.engine}" if self.engine else ""
+        title = (
+            f"Policies without training, {self.task}, split {self.split}{engine}: "
+            f"{self.num_episodes:,} episodes each on sets of {self.set_size}."
+        )
+        names = [f"{Metric.of(metric).name.lower()} [95 % interval]" for metric in metrics]
+        cells = ["policy", "actions", *names]
+        return [title, "", _line(cells), _line(["---"] * len(cells))]
+
+
+def changed_settings(task: Task, plain: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Those settings of an environment that are not the task's."""
+    default = config_lib.plain(task.environment) or {}
+    return {name: value for name, value in (plain or {}).items() if value != default.get(name)}
+
 
 def anchors_of(group: Group) -> list[Anchors]:
-    """Those of a group's task and split with sets as in its training, of all engines.
+    """Those of a group's task, split and settings with sets as in its training, of all engines.
 
-    They are looked for in the folder of the task that holds the runs.
+    They are looked for in the folder of the task that holds the runs. Of several that are alike,
+    the newest counts.
     """
     parents = group.runs[0].path.parents
     folder = next((p / FOLDER for p in parents if p.name == group.task.name), None)
-    files = [] if folder is None else sorted(folder.glob("*.json"))
-    every = [Anchors.load(file) for file in files]
-    size = int(group.config["ppo"]["rollout"]["set_size"])
-    wanted = group.task.name, group.config["split"], size
-    return [a for a in every if (a.task, a.split, a.set_size) == wanted]
+    files = [] if folder is None else sorted(folder.glob("*.json"), key=lambda f: f.stat().st_mtime)
+    config = group.config
+    changed = changed_settings(group.task, config.get("environment"))
+    wanted = group.task.name, config["split"], config.get("split_seed", 0), changed
+    newest = {
+        anchors.engine: anchors
+        for anchors in map(Anchors.load, files)
+        if (anchors.task, anchors.split, anchors.split_seed, anchors.environment) == wanted
+        and anchors.set_size == config["sets"]["size"]
+    }
+    return [newest[engine] for engine in sorted(newest)]
 
 
 def lines_of(group: Group, part: str = "test") -> dict[str, float]:
     """Means of the selection metric on a part of the split, by policy (and engine, of several)."""
     found = anchors_of(group)
-    lines = {}
-    for anchors in found:
-        end = f" ({anchors.engine})" if len(found) > 1 else ""
-        for policy, parts in anchors.values.items():
-            if part in parts:
-                lines[policy + end] = float(parts[part][group.task.selection_metric]["mean"])
-    return lines
+    return {
+        policy + (f" ({anchors.engine})" if len(found) > 1 else ""): float(
+            parts[part][group.task.selection_metric]["mean"]
+        )
+        for anchors in found
+        for policy, parts in anchors.values.items()
+        if part in parts
+    }
 
 
 def notes_of(groups: Sequence[Group]) -> list[str]:
     """The anchors of several groups as text below a table of results."""
-    distinct = {
-        (anchors.task, anchors.split, anchors.engine): anchors
-        for group in groups
-        for anchors in anchors_of(group)
-    }
-    return [markdown(anchors) for anchors in distinct.values()]
+    return list(dict.fromkeys(markdown(a) for group in groups for a in anchors_of(group)))
 
 
 def markdown(anchors: Anchors) -> str:
@@ -104,17 +169,7 @@ def markdown(anchors: Anchors) -> str:
         for part, summary in parts.items()
     ]
     metrics = next(iter(next(iter(anchors.values.values())).values()))
-    title = (
-        f"Policies without training, {anchors.task}, split {anchors.split}, engine "
-        f"{anchors.engine}: {anchors.num_episodes:,} episodes each on sets of {anchors.set_size}."
-    )
-    return "\n".join([title, "", *table_header(list(metrics)), *rows])
-
-
-def table_header(metrics: Sequence[str]) -> list[str]:
-    """The first two lines of a table of anchors."""
-    names = [f"{Metric.of(metric).name.lower()} [95 % interval]" for metric in metrics]
-    return [_line(["policy", "actions", *names]), _line(["---"] * (2 + len(names)))]
+    return "\n".join([*anchors.heading(list(metrics)), *rows])
 
 
 def table_row(policy: str, part: str, summary: Summary) -> str:

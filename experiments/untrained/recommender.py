@@ -1,4 +1,4 @@
-"""What policies that know the Recommender reach: anchors for the results (spec recommender 6).
+"""What policies that know the Recommender reach (docs/recommender.md, "Anchors").
 
 `random` chooses uniformly; `dot` takes the product with the largest `beta . omega`, the best that
 a policy can do whose table hides `mu`; `oracle` that with the largest `beta . omega + mu`.
@@ -7,24 +7,32 @@ a policy can do whose table hides `mu`; `oracle` that with the largest `beta . o
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from envs_mjx.recommender import Recommender, RecommenderParams, RecommenderState
-from experiments.pipeline.artifacts import Domain
+from envs_mjx.recommender import (
+    Recommender,
+    RecommenderParams,
+    RecommenderSettings,
+    RecommenderState,
+)
+from experiments.reports.anchors import Line
 from jaxnew.environment import Action, Transition
-from jaxnew.evaluation import Evaluator, summarize
+from jaxnew.evaluation import measure, summarize
 from jaxnew.policy import Categorical
 from jaxnew.policy.utility import RandomMethod
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool
+from jaxnew.rollout.contract import Policy, RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions
+from jaxnew.task.domain import Domain
 
 SET_SIZES = (50, 500)
 EPISODES = 5000
-_SEED = 2020
+METRICS = ("click_through_rate", "episode_length")
 
 WEIGHTS = {"random": (0.0, 0.0), "dot": (1.0, 0.0), "oracle": (1.0, 1.0)}  # beta . omega, mu.
 
@@ -69,30 +77,27 @@ class AnchorMethod(RandomMethod):
         return Categorical.masked(known * taste + hidden * projected[..., -1], mask)
 
 
-def rates(ids: np.ndarray, table: jax.Array, name: str, set_size: int, episodes: int) -> Any:
-    """Episode metrics of one anchor with intervals, on sets drawn from `ids`."""
-    env = OpenRecommender()
+def play(env: OpenRecommender, actions: Actions, name: str, episodes: int) -> dict[str, np.ndarray]:
+    """Episode metrics f32[episodes] of one of `WEIGHTS`, from rows that hold beta and mu."""
+    config = RolloutConfig(normalize_observations=False, normalize_rewards=False)
     method = AnchorMethod(WEIGHTS[name])
-    evaluator = Evaluator(env, env.default_params, method, set_size, normalize_observations=False)
-    pool = ActionPool.of(ids, capacity=len(table))
-    statistics = RunningStatistics.zeros((table.shape[1] - 1,))
-    is_greedy = name != "random"
-    key = jax.random.key(_SEED)
-    return summarize(evaluator.run({}, statistics, table, pool, key, episodes, is_greedy))
+    rollout = DeviceRollout(env, env.default_params, method, config)
+    return measure(rollout, Policy({}), actions, episodes, is_greedy=name != "random")
 
 
-def lines(
-    domain: Domain, parts: Sequence[str], set_sizes: Sequence[int], episodes: int
-) -> Iterator[str]:
-    """The table of all anchors, line by line as they are measured."""
-    table = jnp.asarray(domain.universe.engineered["product-mu"])
-    yield "| products | set size | policy | click-through rate [95 % interval] | episode length |"
-    yield "|" + " --- |" * 5
-    for part in parts:
-        for size in set_sizes:
+def measure_anchors(
+    domain: Domain,
+    parts: Sequence[str],
+    set_sizes: Sequence[int],
+    episodes: int,
+    settings: RecommenderSettings,
+) -> Iterator[Line]:
+    """The lines of all anchors as they are measured; see `Line`."""
+    env, episodes = OpenRecommender(**asdict(settings)), episodes or EPISODES
+    table = domain.universe.engineered["product-mu"]
+    for size in set_sizes or SET_SIZES:
+        for part in parts:
+            actions = Actions.of(table, domain.split.ids(part), size, name=f"the {part} actions")
             for name in WEIGHTS:
-                found = rates(domain.split.ids(part), table, name, size, episodes)
-                rate, length = found["click_through_rate"], found["episode_length"]
-                interval = f"[{rate['low']:.3f}, {rate['high']:.3f}]"
-                cells = [part, str(size), name, f"{rate['mean']:.3f} {interval}"]
-                yield "| " + " | ".join([*cells, f"{length['mean']:.1f}"]) + " |"
+                found = summarize(play(env, actions, name, episodes))
+                yield Line(name, part, size, episodes, "", {key: found[key] for key in METRICS})

@@ -1,11 +1,9 @@
-"""What policies without training reach in Shape Stacking (spec shape_stacking 10).
-
-They play the episodes of `evaluate`: the same starts and the same available sets.
-"""
+"""What policies without training reach in Shape Stacking (docs/shape_stacking.md, "Anchors")."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import jax
@@ -13,23 +11,37 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.shape_stacking import ShapeStacking, StackingParams, StackingState, shape_library
+from envs_mjx.shape_stacking import (
+    ShapeStacking,
+    StackingParams,
+    StackingSettings,
+    StackingState,
+    shape_library,
+)
 from envs_mjx.shape_stacking.camera import FRAME_SIZE
-from envs_mjx.shape_stacking.engines import Engine
 from envs_mjx.shape_stacking.rules import Bodies
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.training import EVALUATION_SEED
-from experiments.reports.anchors import Summary
-from experiments.untrained.towers import FLAT_TOPPED
+from experiments.reports.anchors import Line
 from jaxnew.environment import Action, Transition
-from jaxnew.evaluation import Evaluator, summarize
+from jaxnew.evaluation import measure, summarize
 from jaxnew.policy import Categorical
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, AvailableSet
+from jaxnew.rollout.contract import Policy, RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions, AvailableSet
+from jaxnew.task.domain import Domain
 
 EPISODES = 500
 METRICS = ("final_height", "reward")
+
+# Classes that others can stand on.
+FLAT_TOPPED = (
+    "horizontal_rectangle",
+    "arch",
+    "rectangle",
+    "half_rectangle",
+    "cube",
+    "cylinder",
+)
 
 # Policies by name; of those that play at random, the probability of a stop in each action.
 SCRIPTED = "scripted"
@@ -192,48 +204,30 @@ def flat_sizes() -> np.ndarray:
 
 
 def play(
-    engine: Engine, position_dim: int, ids: np.ndarray, name: str, set_size: int, episodes: int
+    env: OpenStacking, name: str, ids: np.ndarray, set_size: int, episodes: int
 ) -> dict[str, np.ndarray]:
-    """Episode metrics f32[episodes] of one anchor.
-
-    Args:
-      engine: simulates.
-      position_dim: of the variant, see `ShapeStacking`.
-      ids: int32[n] shapes that sets are drawn from.
-      name: of `NAMES`.
-      set_size: shapes in a set.
-      episodes: how many.
-    """
-    env = OpenStacking(engine, position_dim)
+    """Episode metrics f32[episodes] of one of `NAMES`, on sets of the shapes int32[n] `ids`."""
     # One action is the whole episode of what stops at once.
-    is_short = RANDOM.get(name) == 1.0
-    params = StackingParams(jnp.int32(1)) if is_short else env.default_params
-    method: Any = StackingAnchor(name, position_dim)
-    evaluator = Evaluator(env, params, method, set_size, normalize_observations=False)
-    table = jnp.asarray(flat_sizes())
-    pool = ActionPool.of(ids, capacity=len(table))
-    key = jax.random.key(EVALUATION_SEED)
-    return evaluator.run({}, RunningStatistics.zeros((2,)), table, pool, key, episodes)
+    params = StackingParams(jnp.int32(1)) if RANDOM.get(name) == 1.0 else env.default_params
+    config = RolloutConfig(normalize_observations=False, normalize_rewards=False)
+    method: Any = StackingAnchor(name, env.position_dim)
+    rollout = DeviceRollout(env, params, method, config)
+    return measure(rollout, Policy({}), Actions.of(flat_sizes(), ids, set_size), episodes)
 
 
-def summaries(
-    domain: Domain, engine: Engine, parts: Sequence[str], set_size: int, episodes: int
-) -> Iterator[tuple[str, str, Summary]]:
-    """Final heights and rewards of every anchor on parts of a split.
-
-    Args:
-      domain: the task, whose variant says how shapes are placed, and the split.
-      engine: simulates.
-      parts: of the split.
-      set_size: shapes in a set.
-      episodes: of each anchor on each part.
-
-    Yields:
-      Anchor, part and metrics with their intervals, as they are measured.
-    """
-    position_dim = domain.task.action_spec.position_dim
-    for name in NAMES:
-        for part in parts:
-            ids = domain.split.ids(part)
-            found = summarize(play(engine, position_dim, ids, name, set_size, episodes))
-            yield name, part, {metric: found[metric] for metric in METRICS}
+def measure_anchors(
+    domain: Domain,
+    parts: Sequence[str],
+    set_sizes: Sequence[int],
+    episodes: int,
+    settings: StackingSettings,
+) -> Iterator[Line]:
+    """The lines of all anchors as they are measured; see `Line`."""
+    env = OpenStacking(position_dim=domain.task.action_spec.position_dim, **asdict(settings))
+    episodes = episodes or EPISODES
+    for size in set_sizes or (domain.task.budget("paper").sets.size,):
+        for name in NAMES:
+            for part in parts:
+                found = summarize(play(env, name, domain.split.ids(part), size, episodes))
+                summary = {metric: found[metric] for metric in METRICS}
+                yield Line(name, part, size, episodes, env.engine.name, summary)

@@ -1,4 +1,5 @@
-"""Towers from lists of drops, on any engine, and the figures of spec shape_stacking 13."""
+"""Towers from lists of drops, on any engine, and the figures that are known of
+some (docs/shape_stacking.md, "Reference figures")."""
 
 from __future__ import annotations
 
@@ -18,16 +19,6 @@ from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
 # In place of a shape's id: nothing is dropped, but 3 s go by (a repeated shape, a stop).
 SETTLE_ONLY = -1
-
-# Classes that others can stand on.
-FLAT_TOPPED = (
-    "horizontal_rectangle",
-    "arch",
-    "rectangle",
-    "half_rectangle",
-    "cube",
-    "cylinder",
-)
 
 Drop = tuple[int, float]  # Shape's id, or `SETTLE_ONLY`, and x in metres.
 
@@ -103,10 +94,10 @@ class Row:
     """One measured figure.
 
     Attributes:
-      check: number in spec 13.
+      check: number in the list of reference figures.
       what: was measured, m.
       spec: value there, or what it says in words.
-      tolerance: how far off it may be; None where the spec wants it not asserted.
+      tolerance: how far off it may be; None where nothing is asserted.
       value: measured.
     """
 
@@ -119,10 +110,10 @@ class Row:
 
 @dataclass(frozen=True)
 class _Case:
-    """A tower and what the spec says of it.
+    """A tower and what is known of it.
 
     Attributes:
-      check: number in spec 13.
+      check: number in the list of reference figures.
       drops: the tower.
       expected: by name: `height`, `reward`, and `x1`, `z1`, `x2`, ... of the drops in order.
       tolerance: of all of them.
@@ -137,7 +128,7 @@ class _Case:
 
 
 _LEFT = -0.65
-_REST = 0.001  # Nothing moves: the spec's own rounding, and contacts that give way a little.
+_REST = 0.001  # Nothing moves: rounding, and contacts that give way a little.
 _CASES = (
     _Case(4, (), {"height": 0.328, "reward": 0.164}, _REST, 798),
     _Case(4, (), {"height": 0.342, "reward": 0.171}, _REST),
@@ -172,7 +163,7 @@ _CASES = (
 
 
 def measured(engine: Engine) -> list[Row]:
-    """The checks 3 and 4 and 6 to 16 of spec 13 on an engine."""
+    """The reference figures 3, 4 and 6 to 16 on an engine."""
     return [*_rests(engine), *_towers(engine), *_released(engine)]
 
 
