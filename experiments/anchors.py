@@ -75,7 +75,7 @@ def measure_anchors(
     for line in measure(domain, parts, sizes, episodes, settings):
         if line.set_size not in found:
             found[line.set_size] = Anchors.of(domain, settings, line)
-            print("\n".join(found[line.set_size].heading(list(line.summary))))
+            print("\n".join(["", *found[line.set_size].heading(list(line.summary))]))
         anchors = found[line.set_size]
         anchors.values.setdefault(line.policy, {})[line.part] = line.summary
         print(table_row(line.policy, line.part, line.summary), flush=True)

@@ -1,13 +1,12 @@
 """The least that a training update can take: operations and bytes over what the machine reaches.
 
-Counted from the shapes of the networks (spec method 5) in float32, for a program that never stores
+Counted from the shapes of the networks (docs/method.md, "Policy networks") in float32, for a program that never stores
 an [m, 64] array: a true floor, below what a compiler can reach that does not fuse products with
 what surrounds them. Left out: biases, activation functions, environment, random numbers, Adam.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
@@ -97,7 +96,7 @@ def update_bytes(shapes: Shapes) -> tuple[int, int]:
 
 @dataclass(frozen=True)
 class Rates:
-    """What the machine was seen to reach, per second of one clock.
+    """What the machine was seen to reach, per second.
 
     Attributes:
       operations: floating-point operations in a matrix product.
@@ -129,61 +128,52 @@ def floor_seconds(shapes: Shapes, rates: Rates) -> dict[str, float]:
 # Products [rows, width] @ [width, width]: two shapes of the network (one microbatch, one minibatch)
 # and two that any matrix library is good at. Then how often, so that a call takes some ms.
 _PRODUCTS = ((256, WIDTH, 2000), (4096, WIDTH, 100), (512, 512, 30), (2048, 2048, 1))
-_CACHED_FLOATS = ((2**13, 20_000), (2**15, 5_000), (2**17, 1_000))  # 32 kB to 512 kB.
-_MEMORY_FLOATS = ((2**26, 2),)  # 256 MB.
+# Numbers and how often: 32 kB to 512 kB stay in the caches, 256 MB do not.
+_COPIES = {
+    "cached_bytes": ((2**13, 20_000), (2**15, 5_000), (2**17, 1_000)),
+    "memory_bytes": ((2**26, 2),),
+}
 
 
-def measure_rates(report: m.Report, repeats: int, is_quick: bool) -> dict[str, Rates]:
-    """Times products and copies; returns the best rates, by the `wall` and by the `cpu` clock."""
+def measure_rates(report: m.Report) -> Rates:
+    """Times products and copies; returns the best rates."""
     subjects: dict[str, m.Subject] = {}
     work: dict[str, tuple[str, float]] = {}
-    for rows, width, times in _PRODUCTS:
-        rows, width, times = (8, 8, 2) if is_quick else (rows, width, times)
+    for sizes in _PRODUCTS:
+        rows, width, times = (8, 8, 2) if report.is_quick else sizes
         name = f"product [{rows}, {width}] @ [{width}, {width}]"
-        subjects[name] = m.compiled(_repeat_product(times), _product_inputs(rows, width))
+        subjects[name] = _products(rows, width, times)
         work[name] = "operations", 2.0 * rows * width * width * times
-    for kind, sizes in (("cached", _CACHED_FLOATS), ("memory", _MEMORY_FLOATS)):
-        for size, times in sizes:
-            size, times = (2**10, 2) if is_quick else (size, times)
-            name = f"copy of {size * _FLOAT_BYTES // 1024} kB ({kind})"
-            subjects[name] = m.compiled(_repeat_copy(times), _copy_inputs(size))
-            work[name] = f"{kind}_bytes", 2.0 * size * _FLOAT_BYTES * times
-    timings = m.measure(subjects, repeats)
-    for name, timing in timings.items():
+    for unit, copies in _COPIES.items():
+        for size, times in ((2**10, 2),) if report.is_quick else copies:
+            name = f"copy of {size * _FLOAT_BYTES // 1024} kB ({unit})"
+            subjects[name] = _copies(size, times)
+            work[name] = unit, 2.0 * size * _FLOAT_BYTES * times
+    best: dict[str, float] = {}
+    for name, timing in report.measure(subjects).items():
         unit, amount = work[name]
         report.timing(name, timing, work={unit: amount}, how="a loop in one program")
-
-    def best(unit: str, clock: str) -> float:
-        return max(
-            work[name][1] / min(getattr(timing, clock))
-            for name, timing in timings.items()
-            if work[name][0] == unit
-        )
-
-    units = ("operations", "cached_bytes", "memory_bytes")
-    return {
-        clock: Rates(*(best(unit, f"{clock}_s") for unit in units)) for clock in ("wall", "cpu")
-    }
+        rate = amount / min(cost.wall_s for cost in timing.costs)
+        best[unit] = max(rate, best.get(unit, 0.0))
+    return Rates(**best)
 
 
-def _repeat_product(times: int) -> Callable[[jax.Array, jax.Array], jax.Array]:
-    return lambda x, weight: jax.lax.fori_loop(0, times, lambda _, x: x @ weight, x)
-
-
-def _product_inputs(rows: int, width: int) -> Callable[[jax.Array], tuple[jax.Array, jax.Array]]:
+def _products(rows: int, width: int, times: int) -> m.Subject:
     def inputs(key: jax.Array) -> tuple[jax.Array, jax.Array]:
         key_x, key_weight = jax.random.split(key)
         # Orthogonal, so that repeated products neither grow nor vanish into slow tiny numbers.
         weight = jax.random.orthogonal(key_weight, width)
         return jax.random.normal(key_x, (rows, width)), weight
 
-    return inputs
+    def repeat(x: jax.Array, weight: jax.Array) -> jax.Array:
+        return jax.lax.fori_loop(0, times, lambda _, x: x @ weight, x)
+
+    return m.compiled(repeat, inputs)
 
 
-def _repeat_copy(times: int) -> Callable[[jax.Array], jax.Array]:
-    # One addition per number, because a plain copy would be left out.
-    return lambda x: jax.lax.fori_loop(0, times, lambda i, x: x + jnp.float32(i), x)
+def _copies(size: int, times: int) -> m.Subject:
+    def repeat(x: jax.Array) -> jax.Array:
+        # One addition per number, because a plain copy would be left out.
+        return jax.lax.fori_loop(0, times, lambda i, x: x + jnp.float32(i), x)
 
-
-def _copy_inputs(size: int) -> Callable[[jax.Array], tuple[jax.Array]]:
-    return lambda key: (jax.random.normal(key, (size,)),)
+    return m.compiled(repeat, lambda key: (jax.random.normal(key, (size,)),))

@@ -1,4 +1,4 @@
-"""How everything here is measured, recorded and printed. Needs jax and absl-py only.
+"""How everything here is measured, recorded and printed. Needs jax, NumPy and absl-py only.
 
 Subjects that are compared run in one process, in alternation: one call of each per round, at least
 five rounds, every round with a key of its own. Compilation is timed apart. Wall and processor time
@@ -13,19 +13,17 @@ import math
 import statistics
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import jax
-from absl import app, flags, logging
 
-from jaxnew.storage.provenance import describe_session
+from experiments.flags import Arguments
+from jaxnew.storage.run_directory import describe_session
 
-QUICK = flags.DEFINE_bool("quick", False, "Tiny sizes: checks that it runs; the times say nothing.")
-OUTPUT = flags.DEFINE_string("output", None, "File that results are appended to, as JSON lines.")
-REPEATS = flags.DEFINE_integer("repeats", 5, "Timed calls of each subject.", lower_bound=5)
+RATIO = "time of the first over time of the second"
 
 # What every line of the output has. See `Report`.
 FIELDS = (
@@ -51,17 +49,28 @@ FIELDS = (
 )
 
 
-@dataclass(frozen=True)
-class Spread:
-    """Median, minimum and maximum of repeated measurements."""
+class Benchmark(Arguments):
+    """The flags of a benchmark, and how it begins: programs are compiled anew, not cached.
 
-    median: float
-    min: float
-    max: float
+    Args:
+      doc: the docstring of its module.
+    """
 
-    @classmethod
-    def of(cls, values: Sequence[float]) -> Spread:
-        return cls(statistics.median(values), min(values), max(values))
+    def __init__(self, doc: str) -> None:
+        super().__init__(doc)
+        self.define("bool", "quick", False, "Tiny sizes: does it run? The times say nothing.")
+        self.define("string", "output", None, "File that JSON lines are appended to.")
+        self.define("integer", "repeats", 5, "Timed calls of each subject.", lower_bound=5)
+
+    def start(self, main: Callable[[], None], arguments: list[str] | None = None) -> None:
+        """Runs `main`; see `Arguments.start`."""
+
+        def compiling() -> None:
+            jax.config.update("jax_enable_compilation_cache", False)
+            jax.config.update("jax_disable_most_optimizations", self.quick)
+            main()
+
+        super().start(compiling, arguments)
 
 
 @dataclass(frozen=True)
@@ -70,6 +79,21 @@ class Cost:
 
     wall_s: float
     cpu_s: float
+
+    @classmethod
+    def median(cls, costs: Sequence[Cost]) -> Cost:
+        """Of each of the two."""
+        walls, cpus = ([getattr(cost, name) for cost in costs] for name in ("wall_s", "cpu_s"))
+        return cls(statistics.median(walls), statistics.median(cpus))
+
+    def __mul__(self, factor: float) -> Cost:
+        return Cost(self.wall_s * factor, self.cpu_s * factor)
+
+    def __add__(self, other: Cost) -> Cost:
+        return Cost(self.wall_s + other.wall_s, self.cpu_s + other.cpu_s)
+
+    def __sub__(self, other: Cost) -> Cost:
+        return self + other * -1.0
 
 
 @dataclass(frozen=True)
@@ -91,9 +115,13 @@ class Subject:
 class Timing:
     """Repeated measurements of a subject, one entry per round."""
 
-    wall_s: tuple[float, ...]
-    cpu_s: tuple[float, ...]
+    costs: tuple[Cost, ...]
     compilation: Cost | None = None
+
+    @property
+    def median(self) -> Cost:
+        """The median of each clock."""
+        return Cost.median(self.costs)
 
 
 def timed(function: Callable[[], Any]) -> tuple[Any, Cost]:
@@ -119,17 +147,16 @@ def measure(subjects: Mapping[str, Subject], repeats: int, seed: int = 0) -> dic
         key = jax.random.fold_in(jax.random.key(seed), round_)
         for name, subject in subjects.items():
             arguments = jax.block_until_ready(subject.inputs(key))
-            _, cost = timed(partial(subject.call, *arguments))
-            if round_ > 0:
-                costs[name].append(cost)
+            costs[name].append(timed(partial(subject.call, *arguments))[1])
     return {
-        name: Timing(
-            tuple(cost.wall_s for cost in costs[name]),
-            tuple(cost.cpu_s for cost in costs[name]),
-            subject.compilation,
-        )
+        name: Timing(tuple(costs[name][1:]), subject.compilation)
         for name, subject in subjects.items()
     }
+
+
+def spread(values: Sequence[float]) -> dict[str, float]:
+    """Median, minimum and maximum of repeated measurements."""
+    return {"median": statistics.median(values), "min": min(values), "max": max(values)}
 
 
 def cpu_s_of(pids: Sequence[int]) -> float:
@@ -146,24 +173,31 @@ def ratio(numerator: Timing, denominator: Timing) -> dict[str, float]:
     Of the medians, for both clocks; and the extremes of the wall-clock ratio within one round,
     which say how far to trust it.
     """
-    rounds = [a / b for a, b in zip(numerator.wall_s, denominator.wall_s, strict=True)]
+    rounds = [
+        one.wall_s / other.wall_s
+        for one, other in zip(numerator.costs, denominator.costs, strict=True)
+    ]
     return {
-        "wall": statistics.median(numerator.wall_s) / statistics.median(denominator.wall_s),
-        "cpu": statistics.median(numerator.cpu_s) / statistics.median(denominator.cpu_s),
+        "wall": numerator.median.wall_s / denominator.median.wall_s,
+        "cpu": numerator.median.cpu_s / denominator.median.cpu_s,
         "wall_min": min(rounds),
         "wall_max": max(rounds),
     }
 
 
-def share_saved(whole: Timing, without: Timing) -> dict[str, float]:
-    """The share of `whole` that goes away with a part, by the medians of both clocks.
+def share_saved(whole: Timing, without: Timing, of: Timing | None = None) -> dict[str, float]:
+    """What goes away with a part, as a share of `of` (default: the whole), by both clocks' medians.
 
     Negative where the stand-in of the part costs more than the part, or where noise is larger.
     """
-    return {
-        "wall": 1.0 - statistics.median(without.wall_s) / statistics.median(whole.wall_s),
-        "cpu": 1.0 - statistics.median(without.cpu_s) / statistics.median(whole.cpu_s),
-    }
+    saved, base = whole.median - without.median, (of or whole).median
+    return {"wall": saved.wall_s / base.wall_s, "cpu": saved.cpu_s / base.cpu_s}
+
+
+def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 
 class Report:
@@ -173,11 +207,17 @@ class Report:
     for what is no single program) or derived numbers (`values`; the others None or empty).
     """
 
-    def __init__(self, benchmark: str) -> None:
-        self._benchmark = benchmark
+    def __init__(self, benchmark: str, arguments: Benchmark) -> None:
+        self._benchmark, self._output = benchmark, arguments.output
+        self.is_quick: bool = arguments.quick
+        self.repeats: int = arguments.repeats
         jax.devices()  # Makes the devices known before the session is described.
         self._session = describe_session()
         print(f"\n{benchmark}: {', '.join(self._session['devices'])}")
+
+    def measure(self, subjects: Mapping[str, Subject]) -> dict[str, Timing]:
+        """See `measure`."""
+        return measure(subjects, self.repeats)
 
     def add_versions(self, *packages: str) -> None:
         """Records the versions of further packages."""
@@ -204,26 +244,25 @@ class Report:
           includes: which of auto-reset, policy, update, rendering, ... the time covers.
           how: anything that a reader must know to repeat or to interpret it.
         """
-        wall, cpu = Spread.of(timing.wall_s), Spread.of(timing.cpu_s)
-        rates = {
-            unit: asdict(Spread.of([amount / seconds for seconds in timing.wall_s]))
-            for unit, amount in work.items()
-        }
+        walls = [cost.wall_s for cost in timing.costs]
+        wall, cpu = spread(walls), spread([cost.cpu_s for cost in timing.costs])
+        rates = {unit: spread([amount / s for s in walls]) for unit, amount in work.items()}
         compilation = timing.compilation
         self._write(
             case=case,
             num_envs=num_envs,
             includes=list(includes),
             how=how,
-            repeats=len(timing.wall_s),
-            wall_s=asdict(wall),
-            cpu_s=asdict(cpu),
+            repeats=len(walls),
+            wall_s=wall,
+            cpu_s=cpu,
             compile_s=None
             if compilation is None
             else {"wall": compilation.wall_s, "cpu": compilation.cpu_s},
             rates=rates,
         )
-        shown = [f"{_milliseconds(wall)}, cpu {cpu.median * 1e3:,.2f} ms"]
+        low, middle, high = (1e3 * wall[name] for name in ("min", "median", "max"))
+        shown = [f"{middle:,.2f} ms [{low:,.2f}, {high:,.2f}], cpu {1e3 * cpu['median']:,.2f} ms"]
         shown += [f"{rate['median']:,.4g} {unit}/s" for unit, rate in rates.items()]
         if compilation is not None:
             shown.append(f"compiled in {compilation.wall_s:.2f} s")
@@ -236,9 +275,17 @@ class Report:
         self._write(case=case, num_envs=num_envs, how=how, values=dict(values))
         self._print(case, [f"{name} {value:,.4g}" for name, value in values.items()])
 
-    def note(self, text: str) -> None:
-        """A line for the reader; not recorded."""
-        print(f"  {text}")
+    def ratio(
+        self,
+        case: str,
+        one: Timing,
+        other: Timing,
+        *,
+        how: str = RATIO,
+        num_envs: int | None = None,
+    ) -> None:
+        """How many times longer one subject takes than the other."""
+        self.values(case, ratio(one, other), how=how, num_envs=num_envs)
 
     def _print(self, case: str, shown: Sequence[str]) -> None:
         print(f"  {case:<58} {'   '.join(shown)}", flush=True)
@@ -247,28 +294,9 @@ class Report:
         record: dict[str, Any] = dict.fromkeys(FIELDS)
         record |= {"includes": [], "rates": {}, "values": {}}
         record |= {name: self._session[name] for name in FIELDS if name in self._session}
-        record |= {"benchmark": self._benchmark, "quick": QUICK.value, **entries}
-        if OUTPUT.value is not None:
-            path = Path(OUTPUT.value)
+        record |= {"benchmark": self._benchmark, "quick": self.is_quick, **entries}
+        if self._output is not None:
+            path = Path(self._output)
             path.parent.mkdir(parents=True, exist_ok=True)
             with path.open("a") as file:
                 file.write(json.dumps(record) + "\n")
-
-
-def _milliseconds(spread: Spread) -> str:
-    low, middle, high = (1e3 * x for x in (spread.min, spread.median, spread.max))
-    return f"{middle:,.2f} ms [{low:,.2f}, {high:,.2f}]"
-
-
-def run_benchmark(main: Callable[[], None]) -> None:
-    """Runs a benchmark's `main` after parsing the flags. Programs are compiled anew, not cached."""
-
-    def wrapped(arguments: Sequence[str]) -> None:
-        if len(arguments) > 1:
-            raise app.UsageError(f"Unknown argument {arguments[1]!r}; options are --flag=value.")
-        logging.set_verbosity(logging.WARNING)
-        jax.config.update("jax_enable_compilation_cache", False)
-        jax.config.update("jax_disable_most_optimizations", QUICK.value)
-        main()
-
-    app.run(wrapped)

@@ -15,9 +15,10 @@ from experiments.benchmarks import _measure as m
 from jaxnew._convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.policy.state_encoder import ImageEncoder
 
+ARGUMENTS = m.Benchmark(__doc__)
+
 FORMS = {"columns": convolution_by_columns, "XLA": convolution_by_xla}
 SIZES = (8, 16, 32, 64, 256)  # Of microbatches.
-RATIO = "time of the first over time of the second"
 
 
 def gradient_subject(
@@ -42,21 +43,23 @@ def gradient_subject(
 
 
 def main() -> None:
-    report = m.Report("images")
-    num_images, side, sizes = (8, 12, (4, 8)) if m.QUICK.value else (1024, 84, SIZES)
-    subjects = {
-        f"{name}, microbatches of {size}": gradient_subject(form, (side, side, 3), num_images, size)
-        for name, form in FORMS.items()
-        for size in sizes
-    }
-    timings = m.measure(subjects, m.REPEATS.value)
+    report = m.Report("images", ARGUMENTS)
+    num_images, side, sizes = (8, 12, (4, 8)) if report.is_quick else (1024, 84, SIZES)
+    timings = report.measure(
+        {
+            f"{name}, microbatches of {size}": gradient_subject(
+                form, (side, side, 3), num_images, size
+            )
+            for name, form in FORMS.items()
+            for size in sizes
+        }
+    )
+    best = f"columns, microbatches of {sizes[1]}"
     for name, timing in timings.items():
         how = f"{num_images} stacks of three {side}x{side} frames, forward and backward"
         report.timing(f"gradient, {name}", timing, work={"images": num_images}, how=how)
-    best = f"columns, microbatches of {sizes[1]}"
-    for name in timings:
-        report.values(f"({name}) / ({best})", m.ratio(timings[name], timings[best]), how=RATIO)
+        report.ratio(f"({name}) / ({best})", timing, timings[best])
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

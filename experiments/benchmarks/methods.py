@@ -4,7 +4,8 @@
 
 The Recommender draws sets of 500 products. What grows with the sets is measured by ablation, as in
 `training`: the update against the same with a cheap stand-in for the utility of gathered rows, and
-for both the utility and the gathering; the rollout against one that draws no sets.
+for both the utility and the gathering; the rollout against one that draws no sets. (Not an update:
+gradients of counted sets, which are neighbours in the table, are cheaper too.)
 """
 
 from __future__ import annotations
@@ -18,24 +19,16 @@ import jax.numpy as jnp
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
 from experiments.benchmarks.training import CountedSets
-from experiments.pipeline.methods import VARIANTS
-from experiments.pipeline.training import Trainer
 from jaxnew.policy import Categorical, UtilityMethod
-from jaxnew.ppo import TrainState
+from jaxnew.ppo import Learner
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.task.methods import VARIANTS
+
+ARGUMENTS = m.Benchmark(__doc__)
 
 TASKS = ("grid_world", "recommender")
-PARTS = ("utility", "utility and gathering")
-
-
-def update_subject(trainer: Trainer) -> m.Subject:
-    """One update from a fresh state."""
-    start = trainer.init()
-    numbers, table, pool = trainer.config.hyperparameters, trainer.table, trainer.training_pool
-
-    def update(state: TrainState) -> Any:
-        return trainer.learner.update(state, numbers, table, pool)
-
-    return m.compiled(update, lambda key: (replace(start, key=key),))
+# "no-entropy" is the same program as ours, and "random" no method.
+METHODS = tuple(name for name in VARIANTS if name not in ("no-entropy", "random"))
 
 
 class SumOfRow(UtilityMethod):
@@ -55,89 +48,55 @@ class OneNumber(SumOfRow):
         return jnp.sum(super().project(params, representations), axis=-1, keepdims=True)
 
 
-def part_subjects(trainer: Trainer) -> dict[str, m.Subject]:
-    """The update of ours with cheap stand-ins for what it does with the rows of its sets."""
-    learner = trainer.learner
-    variants = {"utility": SumOfRow(), "utility and gathering": OneNumber()}
-    return {
-        name: update_subject(
-            replace(
-                trainer,
-                learner=replace(learner, rollout=replace(learner.rollout, method=method)),
-            )
+def compare(report: m.Report, task: str) -> None:
+    """The methods of one domain."""
+    trainers = {n: _trainers.make_trainer(report.is_quick, task, n) for n in METHODS}
+    states = {name: trainer.init() for name, trainer in trainers.items()}
+    ours, start = trainers["ours"], states["ours"]
+    assert isinstance(ours.rollout, DeviceRollout)
+    stand_ins = {"utility": SumOfRow(), "utility and gathering": OneNumber()}
+    learners = {
+        name: Learner(replace(ours.rollout, method=method), ours.config.ppo)
+        for name, method in stand_ins.items()
+    }
+    counted = CountedSets(**vars(ours.training))
+    timings = report.measure(
+        {name: _trainers.updating(trainers[name], states[name]) for name in METHODS}
+        | {f"ours without {k}": _trainers.updating(ours, start, v) for k, v in learners.items()}
+        | {
+            "rollout": _trainers.collecting(ours, start),
+            "rollout without set drawing": _trainers.collecting(ours, start, actions=counted),
+        }
+    )
+    steps = {name: trainers.get(name, ours).config.ppo.steps_per_update for name in timings}
+    for name, timing in timings.items():
+        report.timing(
+            f"{task}: {name}",
+            timing,
+            work={"steps": steps[name]},
+            num_envs=ours.config.ppo.rollout.num_envs,
+            includes=["auto-reset", "policy", "update"] if name in METHODS else [],
+            how=_trainers.describe(trainers.get(name, ours)),
         )
-        for name, method in variants.items()
-    }
-
-
-def rollout_subjects(trainer: Trainer) -> dict[str, m.Subject]:
-    """A rollout of ours, and one whose sets are counted off.
-
-    Not an update: gradients of counted sets, which are neighbours in the table, are cheaper too.
-    """
-    start, numbers = trainer.init(), trainer.config.hyperparameters
-    whole = trainer.learner.rollout
-    counted = CountedSets(whole.env, whole.env_params, whole.method, whole.config)
-
-    def inputs(key: jax.Array) -> tuple[Any, ...]:
-        pool = trainer.training_pool
-        return key, start.rollout, start.params, trainer.table, pool, numbers.discount
-
-    return {
-        "rollout": m.compiled(whole.collect, inputs),
-        "rollout without set drawing": m.compiled(counted.collect, inputs),
-    }
-
-
-def title(name: str) -> str:
-    """What a subject is called in the report."""
-    return f"ours without {name}" if name in PARTS else name
+    for name in METHODS[1:]:
+        scale = steps["ours"] / steps[name]
+        per_step = {k: scale * v for k, v in m.ratio(timings[name], timings["ours"]).items()}
+        how = "time per environment step over that of ours"
+        report.values(f"{task}: {name} / ours", per_step, how=how)
+    how = "1 - time with a cheap stand-in / time of an update of ours, of medians"
+    for name in stand_ins:
+        share = m.share_saved(timings["ours"], timings[f"ours without {name}"])
+        report.values(f"{task}: share of {name}", share, how=how)
+    saved = timings["rollout"], timings["rollout without set drawing"], timings["ours"]
+    how = "what the rollout saves with sets that are counted off / time of an update of ours"
+    report.values(f"{task}: share of set drawing", m.share_saved(*saved), how=how)
 
 
 def main() -> None:
-    report = m.Report("methods")
+    report = m.Report("methods", ARGUMENTS)
     for task in TASKS:
-        trainers = {
-            name: _trainers.make_trainer(task=task, method=name)
-            for name in VARIANTS
-            if name not in ("no-entropy", "random")  # The same program as ours, and no method.
-        }
-        subjects = {name: update_subject(trainer) for name, trainer in trainers.items()}
-        subjects |= part_subjects(trainers["ours"]) | rollout_subjects(trainers["ours"])
-        timings = m.measure(subjects, m.REPEATS.value)
-        for name, timing in timings.items():
-            trainer = trainers.get(name, trainers["ours"])
-            steps = trainer.config.ppo.steps_per_update
-            report.timing(
-                f"{task}: {title(name)}",
-                timing,
-                work={"steps": steps},
-                num_envs=trainer.config.ppo.rollout.num_envs,
-                includes=["auto-reset", "policy", "update"] if name in trainers else [],
-                how=_trainers.describe(trainer),
-            )
-        for name in trainers:
-            if name != "ours":
-                scale = (
-                    trainers["ours"].config.ppo.steps_per_update
-                    / trainers[name].config.ppo.steps_per_update
-                )
-                per_step = {
-                    clock: scale * value
-                    for clock, value in m.ratio(timings[name], timings["ours"]).items()
-                }
-                how = "time per environment step over that of ours"
-                report.values(f"{task}: {name} / ours", per_step, how=how)
-        for name in PARTS:
-            how = "1 - time with a cheap stand-in / time of an update of ours, of medians"
-            share = m.share_saved(timings["ours"], timings[name])
-            report.values(f"{task}: share of {name}", share, how=how)
-        drawing = m.share_saved(timings["rollout"], timings["rollout without set drawing"])
-        of_update = m.ratio(timings["rollout"], timings["ours"])
-        values = {clock: share * of_update[clock] for clock, share in drawing.items()}
-        how = "what the rollout saves with sets that are counted off / time of an update of ours"
-        report.values(f"{task}: share of set drawing", values, how=how)
+        compare(report, task)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

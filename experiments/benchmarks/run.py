@@ -8,8 +8,6 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from absl import flags
-
 from experiments.benchmarks import _measure as m
 
 SUBJECTS = (
@@ -18,7 +16,6 @@ SUBJECTS = (
     "images",
     "training",
     "methods",
-    "evaluation",
     "representation",
     "sweep",
     "pool",
@@ -27,15 +24,16 @@ SUBJECTS = (
     "stacking",
     "stacking_training",
 )
-ONLY = flags.DEFINE_list("only", list(SUBJECTS), "Which benchmarks, in this order.")
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define("list", "only", list(SUBJECTS), "Which benchmarks, in this order.")
 
 
 def main() -> None:
-    arguments = [f"--quick={m.QUICK.value}", f"--repeats={m.REPEATS.value}"]
-    if m.OUTPUT.value is not None:
-        arguments.append(f"--output={m.OUTPUT.value}")
+    arguments = [f"--quick={ARGUMENTS.quick}", f"--repeats={ARGUMENTS.repeats}"]
+    if ARGUMENTS.output is not None:
+        arguments.append(f"--output={ARGUMENTS.output}")
     failed = []
-    for name in ONLY.value:
+    for name in ARGUMENTS.only:
         command = [sys.executable, "-m", f"experiments.benchmarks.{name}", *arguments]
         if subprocess.run(command, check=False).returncode:
             failed.append(name)
@@ -44,4 +42,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

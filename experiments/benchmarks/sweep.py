@@ -12,47 +12,38 @@ import jax
 
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
-from experiments.pipeline.training import Trainer
-from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
+from jaxnew.sweeping import SweepProgram, member_configs
+from jaxnew.trainer import Trainer
 
-NUM_MEMBERS = 8
+ARGUMENTS = m.Benchmark(__doc__)
+
+SEEDS = range(31, 39)
 # A grid of the paper's size (appendix, "Hyperparameter Search"): 8 coefficients, 4 seeds each.
-GRID = "entropy_coefficient=1e-4,5e-4,1e-3,5e-3,1e-2,2e-2,5e-2,1e-1"
-GRID_SEEDS = 4
+GRID = {"entropy_coefficient": (1e-4, 5e-4, 1e-3, 5e-3, 1e-2, 2e-2, 5e-2, 1e-1)}
+GRID_SEEDS = SEEDS[:4]
 SINGLE_RUNS = "single runs"
-GRID_NAME = "one program, grid of 32"
-RATIO = "time of the first over time of the second, for the same updates"
+GRID_NAME = "grid of 32"
+HOW = "time per update and member of the first over that of the second"
 
 
-def make_sweep(
-    trainer: Trainer, devices: list[jax.Device], at_once: int, has_grid: bool = False
-) -> Sweep:
-    """Members that differ in their seed, or a grid of hyper-parameters and seeds."""
-    num_seeds = GRID_SEEDS if has_grid else NUM_MEMBERS
-    seeds = [31 + member for member in range(num_seeds)]
-    configs = member_configs(trainer.config, seeds, [GRID] if has_grid else [])
-    return Sweep.of(trainer, configs, devices, at_once)
-
-
-def sweep_subject(sweep: Sweep, num_updates: int) -> m.Subject:
+def sweep_subject(program: SweepProgram, num_updates: int) -> m.Subject:
     """All members in one program."""
-    members = sweep.init().members
+    members = program.init().members
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
-        keys = jax.device_put(jax.random.split(key, len(sweep.configs)), sweep.sharding)
-        return replace(members, key=keys), sweep.hyperparameters
+        keys = jax.device_put(jax.random.split(key, len(program.configs)), program.sharding)
+        return replace(members, key=keys), program.hyperparameters
 
-    return m.compiled(lambda *args: sweep._updates(*args, n=num_updates), inputs)
+    return m.compiled(lambda *args: program._updates(*args, n=num_updates), inputs)
 
 
 def singles_subject(trainer: Trainer, num_updates: int) -> m.Subject:
     """The members as runs of `train`, one after the other with one compiled program."""
-    start = trainer.init()
-    numbers, table, pool = trainer.config.hyperparameters, trainer.table, trainer.pools["train"]
+    start, numbers, actions = trainer.init(), trainer.config.hyperparameters, trainer.training
 
     def update(state: TrainState) -> Any:
-        return trainer.learner.updates(state, numbers, table, pool, num_updates)
+        return trainer.learner.updates(state, numbers, actions, num_updates)
 
     one = m.compiled(update, lambda key: (replace(start, key=key),))
 
@@ -60,76 +51,55 @@ def singles_subject(trainer: Trainer, num_updates: int) -> m.Subject:
         return [jax.block_until_ready(one.call(state)) for state in states]
 
     def inputs(key: jax.Array) -> tuple[list[TrainState]]:
-        return ([replace(start, key=k) for k in jax.random.split(key, NUM_MEMBERS)],)
+        return ([replace(start, key=k) for k in jax.random.split(key, len(SEEDS))],)
 
     return m.Subject(run_all, inputs, one.compilation)
 
 
-def with_compilation(timing: m.Timing, times: int = 1) -> m.Timing:
-    """Rounds that each begin with compiling, `times` times."""
-    assert timing.compilation is not None
-    wall, cpu = timing.compilation.wall_s, timing.compilation.cpu_s
-    return m.Timing(
-        tuple(times * wall + seconds for seconds in timing.wall_s),
-        tuple(times * cpu + seconds for seconds in timing.cpu_s),
-    )
-
-
-def subjects_of(trainer: Trainer, num_updates: int) -> dict[str, m.Subject]:
-    """Single runs, and the sweep on one device or all, its members in turn or side by side."""
-    subjects = {SINGLE_RUNS: singles_subject(trainer, num_updates)}
-    for devices in (jax.devices()[:1], jax.devices()):
-        for at_once, how in ((1, "in turn"), (NUM_MEMBERS, "side by side")):
-            sweep = make_sweep(trainer, devices, at_once)
-            name = f"one program, {len(devices)} device(s), {how}"
-            subjects[name] = sweep_subject(sweep, num_updates)
-    grid = make_sweep(trainer, jax.devices(), 1, has_grid=True)
-    subjects[GRID_NAME] = sweep_subject(grid, num_updates)
-    return subjects
-
-
-def compare(
-    report: m.Report, name: str, together: m.Timing, apart: m.Timing, num_updates: int
-) -> None:
-    """Records how many times faster than single runs a sweep is."""
-    case = f"{SINGLE_RUNS} / {name}"
-    report.values(case, m.ratio(apart, together), how=f"{RATIO}; without compiling")
-    values = m.ratio(with_compilation(apart, NUM_MEMBERS), with_compilation(together))
-    how = f"{RATIO}; every single run in a process that compiles, {num_updates} updates"
-    report.values(f"{case}, with compiling", values, how=how)
-
-
-def record(
-    report: m.Report, trainer: Trainer, timings: dict[str, m.Timing], num_updates: int
-) -> None:
-    for name, timing in timings.items():
-        num_members = 32 if name == GRID_NAME else NUM_MEMBERS
-        steps = num_members * num_updates * trainer.config.ppo.steps_per_update
-        report.timing(
-            name if name == GRID_NAME else f"{NUM_MEMBERS} seeds {name}",
-            timing,
-            work={"steps": steps},
-            num_envs=num_members * trainer.config.ppo.rollout.num_envs,
-            includes=["auto-reset", "policy", "update"],
-            how=f"{num_updates} updates of each seed; {_trainers.describe(trainer)}",
-        )
+def scaled(timing: m.Timing, factor: float = 1.0, compilations: int = 0) -> m.Timing:
+    """Rounds that take `factor` times as long, after compiling so many times."""
+    start = (timing.compilation or m.Cost(0.0, 0.0)) * compilations
+    return m.Timing(tuple(start + cost * factor for cost in timing.costs))
 
 
 def main() -> None:
     jax.config.update("jax_num_cpu_devices", 2)
-    report = m.Report("sweep")
-    trainer = _trainers.make_trainer()
-    num_updates = 1 if m.QUICK.value else 2
-    timings = m.measure(subjects_of(trainer, num_updates), m.REPEATS.value)
-    record(report, trainer, timings, num_updates)
+    report = m.Report("sweep", ARGUMENTS)
+    trainer = _trainers.make_trainer(report.is_quick)
+    num_updates = 1 if report.is_quick else 2
+    members = member_configs(trainer.config, list(SEEDS), {})
+    grid = member_configs(trainer.config, list(GRID_SEEDS), GRID)
+    programs = {
+        f"{len(devices)} device(s), members {how}": SweepProgram.of(
+            trainer, members, devices, at_once
+        )
+        for devices in (jax.devices()[:1], jax.devices())
+        for at_once, how in ((1, "in turn"), (len(members), "side by side"))
+    }
+    programs[GRID_NAME] = SweepProgram.of(trainer, grid, jax.devices(), 1)
+    timings = report.measure(
+        {SINGLE_RUNS: singles_subject(trainer, num_updates)}
+        | {name: sweep_subject(program, num_updates) for name, program in programs.items()}
+    )
+    apart = timings[SINGLE_RUNS]
     for name, timing in timings.items():
-        if name == GRID_NAME:  # Four times the work of the single runs.
-            values = {c: 4.0 * v for c, v in m.ratio(timings[SINGLE_RUNS], timing).items()}
-            how = "time per update and member of the first over that of the second; no compiling"
-            report.values(f"{SINGLE_RUNS} / {name}", values, how=how)
-        elif name != SINGLE_RUNS:
-            compare(report, name, timing, timings[SINGLE_RUNS], num_updates)
+        num_members = len(programs[name].configs) if name in programs else len(members)
+        report.timing(
+            name,
+            timing,
+            work={"steps": num_members * num_updates * trainer.config.ppo.steps_per_update},
+            num_envs=num_members * trainer.config.ppo.rollout.num_envs,
+            includes=["auto-reset", "policy", "update"],
+            how=f"{num_updates} updates of each member; {_trainers.describe(trainer)}",
+        )
+        if name == SINGLE_RUNS:
+            continue
+        more, case = num_members / len(members), f"{SINGLE_RUNS} / {name}"
+        report.ratio(case, scaled(apart, more), timing, how=f"{HOW}; without compiling")
+        compiling = scaled(apart, more, num_members), scaled(timing, compilations=1)
+        how = f"{HOW}; every single run in a process that compiles, {num_updates} updates"
+        report.ratio(f"{case}, with compiling", *compiling, how=how)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

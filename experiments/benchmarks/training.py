@@ -1,6 +1,7 @@
-"""Training at the paper's shapes: steps per second, where the time goes, how far from the floor.
+"""Grid World at the paper's shapes: steps per second, where the time goes, how far from the floor.
 
     python -m experiments.benchmarks.training
+    python -m experiments.benchmarks.training --parts=update    # Half a minute.
 
 Where the time goes is measured by ablation: the compiled whole against the same program with one
 part replaced by a cheap stand-in, in alternation in one process. A part's share is what goes away
@@ -9,37 +10,39 @@ with it. Shares need not add up to one: what a part costs depends on what runs b
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 
 from envs_mjx.grid_world import GridWorld, GridWorldParams, GridWorldState
 from experiments.benchmarks import _floor, _trainers
 from experiments.benchmarks import _measure as m
-from experiments.pipeline.training import Trainer
 from jaxnew import sampling
 from jaxnew.environment import Action, Transition
 from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.ppo import Hyperparameters, Learner, TrainState, gae
 from jaxnew.ppo.objective import Minibatch, normalize_advantages
-from jaxnew.rollout.batch import RolloutBatch
+from jaxnew.rollout.contract import RolloutBatch
 from jaxnew.rollout.device import DeviceRollout
-from jaxnew.sampling import ActionPool, AvailableSet
+from jaxnew.sampling import Actions, AvailableSet
+from jaxnew.trainer import Trainer
+
+PARTS = ("update", "rollout", "learning", "sets", "floor", "evaluation")
+
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define("list", "parts", list(PARTS), f"What is timed: {', '.join(PARTS)}.")
 
 
-class CountedSets(DeviceRollout):
+@struct.dataclass
+class CountedSets(Actions):
     """Sets counted off instead of drawn."""
 
-    def _draw(self, key: jax.Array, shape: tuple[int, ...], pool: ActionPool) -> AvailableSet:
-        del key
-        first = jnp.arange(shape[0]).reshape(-1, *[1] * len(shape))
-        index = (first + jnp.arange(self.config.set_size)) % pool.size
-        ids = jnp.broadcast_to(pool.ids[index], (*shape, self.config.set_size))
+    def draw(self, keys: jax.Array) -> AvailableSet:
+        first = jnp.arange(keys.size).reshape(*keys.shape, 1)
+        ids = self.pool.ids[(first + jnp.arange(self.set_size)) % self.pool.size]
         return AvailableSet(ids, ids >= 0)
 
 
@@ -94,8 +97,8 @@ class WithoutGradient(Learner):
         params: Any,
         minibatch: Minibatch,
         hyperparameters: Hyperparameters,
-        table: jax.Array,
-        fixed_set: AvailableSet | None = None,
+        actions: Actions,
+        available: AvailableSet,
     ) -> tuple[Any, dict[str, jax.Array]]:
         total = sum(jnp.sum(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(minibatch))
         total = jnp.asarray(total) * 1e-6
@@ -111,77 +114,38 @@ class InOrder(Learner):
         return jnp.tile(indices, (self.config.num_epochs, 1))
 
 
-class WithoutOptimizer(Learner):
-    """Plain gradient descent in place of clipping and Adam."""
-
-    @property
-    def optimizer(self) -> optax.GradientTransformation:
-        return optax.identity()
+Subjects = dict[str, m.Subject]
 
 
-Timings = dict[str, m.Timing]
+def without(part: str) -> str:
+    """What a subject is called in which a part has a stand-in."""
+    return f"without {part}"
 
 
-def rollout_variants(learner: Learner) -> dict[str, DeviceRollout]:
+def rollout_subjects(trainer: Trainer, state: TrainState) -> Subjects:
     """The rollout, and versions of it in each of which one part is replaced."""
-    whole = learner.rollout
+    whole = trainer.rollout
+    assert isinstance(whole, DeviceRollout)
     unscaled = replace(whole.config, normalize_observations=False, normalize_rewards=False)
-    still = StillWorld()
-    nothing = CountedSets(still, whole.env_params, _Nothing(), unscaled)
-    return {
-        "rollout": whole,
-        "set drawing": CountedSets(whole.env, whole.env_params, whole.method, whole.config),
+    counted = CountedSets(**vars(trainer.training))
+    variants = {
         "normalisation": replace(whole, config=unscaled),
         "inference": replace(whole, method=WithoutInference()),
         "sampling": replace(whole, method=WithoutSampling()),
-        "environment": replace(whole, env=still),
-        "all of them": nothing,
+        "environment": replace(whole, env=StillWorld()),
     }
-
-
-class _Nothing(WithoutInference):
-    """Neither scores, nor values, nor samples."""
-
-    def distribution(
-        self, params: Any, obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> Categorical:
-        return FirstChoice(jnp.zeros(mask.shape))
-
-
-def learner_variants(learner: Learner) -> dict[str, Learner]:
-    """Likewise for the gradient steps."""
-    parts = learner.rollout, learner.config
     return {
-        "learning": learner,
-        "gradients": WithoutGradient(*parts),
-        "permutation": InOrder(*parts),
-        "optimizer": WithoutOptimizer(*parts),
+        "rollout": _trainers.collecting(trainer, state),
+        without("set drawing"): _trainers.collecting(trainer, state, actions=counted),
+        **{without(k): _trainers.collecting(trainer, state, v) for k, v in variants.items()},
     }
 
 
-def subjects_of(trainer: Trainer, state: TrainState) -> dict[str, m.Subject]:
-    """The update, its two halves, their variants, and parts alone."""
-    learner, table, pool = trainer.learner, trainer.table, trainer.pools["train"]
-    numbers = trainer.config.hyperparameters
-    collect = jax.jit(learner.rollout.collect)
-
-    def update_inputs(key: jax.Array) -> tuple[Any, ...]:
-        return replace(state, key=key), numbers, table, pool
-
-    def rollout_inputs(key: jax.Array) -> tuple[Any, ...]:
-        return key, state.rollout, state.params, table, pool, numbers.discount
-
-    def batch_of(key: jax.Array) -> RolloutBatch:
-        return collect(*rollout_inputs(key))[1]
-
-    def learn_inputs(learner: Learner) -> Callable[[jax.Array], tuple[Any, ...]]:
-        def inputs(key: jax.Array) -> tuple[Any, ...]:
-            key_batch, key_learn = jax.random.split(key)
-            opt_state = learner.optimizer.init(state.params)
-            batch = batch_of(key_batch)
-            return key_learn, state.params, opt_state, batch, numbers, table, state.step
-
-        return inputs
+def learning_subjects(trainer: Trainer, state: TrainState) -> Subjects:
+    """Likewise for the gradient steps; and the advantages alone."""
+    learner, numbers = trainer.learner, trainer.config.hyperparameters
+    parts = learner.rollout, learner.config
+    whole = _trainers.learning(trainer, state)
 
     def advantages(batch: RolloutBatch) -> tuple[jax.Array, jax.Array]:
         values, targets = gae(
@@ -195,103 +159,75 @@ def subjects_of(trainer: Trainer, state: TrainState) -> dict[str, m.Subject]:
         )
         return normalize_advantages(values), targets
 
-    subjects = {"update": m.compiled(learner.update, update_inputs)}
-    for name, rollout in rollout_variants(learner).items():
-        subjects[name] = m.compiled(rollout.collect, rollout_inputs)
-    for name, variant in learner_variants(learner).items():
-        subjects[name] = m.compiled(variant.learn, learn_inputs(variant))
-    subjects["advantages alone"] = m.compiled(advantages, lambda key: (batch_of(key),))
-    return subjects | set_drawing_subjects(trainer)
-
-
-def set_drawing_subjects(trainer: Trainer) -> dict[str, m.Subject]:
-    """One set for every step of an update: as it is drawn, and by sorting noise over the pool."""
-    pool, config = trainer.pools["train"], trainer.config.ppo
-
-    def by_sorting(keys: jax.Array) -> jax.Array:
-        return jax.vmap(lambda key: sampling._by_sorting_noise(key, pool, config.rollout.set_size))(
-            keys
-        )
-
-    def inputs(key: jax.Array) -> tuple[jax.Array]:
-        return (jax.random.split(key, config.steps_per_update),)
-
     return {
-        "draw_sets alone": m.compiled(
-            lambda keys: sampling.draw_sets(keys, pool, config.rollout.set_size), inputs
-        ),
-        "top-k of noise alone": m.compiled(by_sorting, inputs),
+        "learning": whole,
+        without("gradients"): _trainers.learning(trainer, state, WithoutGradient(*parts)),
+        without("permutation"): _trainers.learning(trainer, state, InOrder(*parts)),
+        "advantages": m.compiled(advantages, lambda key: (whole.inputs(key)[3],)),
     }
 
 
-ROLLOUT_PARTS = ("set drawing", "normalisation", "inference", "sampling", "environment")
-LEARNING_PARTS = ("gradients", "permutation", "optimizer")
+def set_subjects(trainer: Trainer) -> Subjects:
+    """One set for every step of an update: as it is drawn, and by sorting noise over the pool."""
+    actions, steps = trainer.training, trainer.config.ppo.steps_per_update
+
+    def by_sorting(keys: jax.Array) -> jax.Array:
+        draw = sampling._by_sorting_noise
+        return jax.vmap(lambda key: draw(key, actions.pool, actions.set_size))(keys)
+
+    def inputs(key: jax.Array) -> tuple[jax.Array]:
+        return (jax.random.split(key, steps),)
+
+    return {
+        "set drawing": m.compiled(actions.draw, inputs),
+        "top-k of noise": m.compiled(by_sorting, inputs),
+    }
 
 
-def report_timings(report: m.Report, trainer: Trainer, timings: Timings) -> None:
-    """Every timing, with what it is."""
-    shapes = _trainers.describe(trainer)
-    config = trainer.config.ppo
+def report_parts(report: m.Report, trainer: Trainer, timings: dict[str, m.Timing]) -> None:
+    """Every timing, and where an update's time goes."""
+    ppo, shapes = trainer.config.ppo, _trainers.describe(trainer)
     covers = {"update": ["auto-reset", "policy", "update"], "rollout": ["auto-reset", "policy"]}
+    whole, update = "", timings["update"]
     for name, timing in timings.items():
-        if name in ROLLOUT_PARTS or name == "all of them":
-            case, how = f"rollout without {name}", "replaced by a cheap stand-in"
-        elif name in LEARNING_PARTS:
-            case, how = f"learning without {name}", "replaced by a cheap stand-in"
-        else:
-            case, how = name, "compiled by itself"
-        is_sets = name in ("draw_sets alone", "top-k of noise alone")
+        is_set = name in ("set drawing", "top-k of noise")
+        whole = name if name in ("rollout", "learning") else whole
+        is_ablated = name.startswith("without")
         report.timing(
-            case,
+            f"{whole} {name}" if is_ablated else name,
             timing,
-            work={"sets" if is_sets else "steps": config.steps_per_update},
-            num_envs=config.rollout.num_envs,
+            work={"sets" if is_set else "steps": ppo.steps_per_update},
+            num_envs=ppo.rollout.num_envs,
             includes=covers.get(name, []),
-            how=f"{how}; {shapes}",
+            how=f"{'a part has a cheap stand-in' if is_ablated else 'compiled alone'}; {shapes}",
         )
-
-
-def report_shares(report: m.Report, timings: Timings) -> None:
-    """Where an update's time goes."""
-    update = timings["update"]
-    for name in ("rollout", "learning", "advantages alone", "draw_sets alone"):
-        how = "time of the part compiled by itself over that of the update"
-        report.values(f"{name} / update", m.ratio(timings[name], update), how=how)
-    for whole, parts in (
-        ("rollout", (*ROLLOUT_PARTS, "all of them")),
-        ("learning", LEARNING_PARTS),
-    ):
-        for part in parts:
-            share = m.share_saved(timings[whole], timings[part])
-            of_update = m.ratio(timings[whole], update)
-            values = {f"of {whole} ({clock})": share[clock] for clock in share}
-            values |= {f"of update ({clock})": share[clock] * of_update[clock] for clock in share}
-            how = f"1 - time without the part / time of the whole {whole}, of medians"
-            report.values(f"share of {part}", values, how=how)
-    report.values(
-        "top-k of noise / draw_sets",
-        m.ratio(timings["top-k of noise alone"], timings["draw_sets alone"]),
-        how="time of the first over time of the second, for the same number of sets",
-    )
-
-
-def shapes_of(trainer: Trainer) -> _floor.Shapes:
-    """The sizes that the floor is counted from."""
-    env, config = trainer.learner.rollout.env, trainer.config.ppo
-    return _floor.Shapes(
-        obs_size=env.observation_spec(env.default_params).shape[0],
-        representation_size=trainer.table.shape[1],
-        num_actions=trainer.table.shape[0],
-        set_size=config.rollout.set_size,
-        steps=config.steps_per_update,
-        epochs=config.num_epochs,
-        gradient_steps=config.num_epochs * config.num_minibatches,
-    )
+        if is_ablated:
+            of_whole = m.share_saved(timings[whole], timing)
+            of_update = m.share_saved(timings[whole], timing, update)
+            values = {f"of {whole} ({clock})": share for clock, share in of_whole.items()}
+            values |= {f"of update ({clock})": share for clock, share in of_update.items()}
+            how = f"1 - time {name} / time of the whole {whole}, of medians"
+            report.values(f"share of {name.removeprefix('without ')}", values, how=how)
+        elif name != "update":
+            how = "time of the part compiled alone over that of the update"
+            report.ratio(f"{name} / update", timing, update, how=how)
+    if "top-k of noise" in timings:
+        slow, fast = timings["top-k of noise"], timings["set drawing"]
+        report.ratio("top-k of noise / set drawing", slow, fast)
 
 
 def report_floor(report: m.Report, trainer: Trainer, update: m.Timing) -> None:
-    """The floor of an update and the fraction of it that training reaches, by both clocks."""
-    shapes = shapes_of(trainer)
+    """The floor of an update and the fraction of it that training reaches."""
+    ppo, actions = trainer.config.ppo, trainer.training
+    shapes = _floor.Shapes(
+        obs_size=trainer.rollout.observation.shape[0],
+        representation_size=actions.table.shape[1],
+        num_actions=actions.table.shape[0],
+        set_size=actions.set_size,
+        steps=ppo.steps_per_update,
+        epochs=ppo.num_epochs,
+        gradient_steps=ppo.num_epochs * ppo.num_minibatches,
+    )
     cached, memory = _floor.update_bytes(shapes)
     per_step = {
         "operations": _floor.update_operations(shapes) / shapes.steps,
@@ -300,28 +236,57 @@ def report_floor(report: m.Report, trainer: Trainer, update: m.Timing) -> None:
     }
     how = "counted from the shapes, see experiments/benchmarks/_floor.py"
     report.values("floor: needed per environment step", per_step, how=how)
-    measured = {"wall": m.Spread.of(update.wall_s), "cpu": m.Spread.of(update.cpu_s)}
-    for clock, rates in _floor.measure_rates(report, m.REPEATS.value, m.QUICK.value).items():
-        floor = _floor.floor_seconds(shapes, rates)
-        values = {
-            **floor,
-            "update_s": measured[clock].median,
-            "fraction of floor": floor["max_s"] / measured[clock].median,
-            "fraction of sum": floor["sum_s"] / measured[clock].median,
-        }
-        how = "needed operations and bytes over the best rates measured above, in this process"
-        report.values(f"floor of an update ({clock} clock)", values, how=how)
+    floor, seconds = (
+        _floor.floor_seconds(shapes, _floor.measure_rates(report)),
+        update.median.wall_s,
+    )
+    values = {
+        **floor,
+        "update_s": seconds,
+        "fraction of floor": floor["max_s"] / seconds,
+        "fraction of sum": floor["sum_s"] / seconds,
+    }
+    how = "needed operations and bytes over the best rates measured above, in this process"
+    report.values("floor of an update", values, how=how)
+
+
+def report_evaluation(report: m.Report, trainer: Trainer, state: TrainState) -> None:
+    """Episodes per second of a policy on test action sets."""
+    num_episodes, actions = 200 if report.is_quick else 5000, trainer.actions("test")
+
+    def play(key: jax.Array) -> Any:
+        return trainer.rollout.measure(state.policy, actions, key, num_episodes)
+
+    timing = report.measure({"evaluation": m.Subject(play, lambda key: (key,))})["evaluation"]
+    report.timing(
+        "evaluation, sampled actions",
+        timing,
+        work={"episodes": num_episodes},
+        num_envs=trainer.task.evaluation_width,
+        includes=["set drawing", "policy", "transfer"],
+        how=f"{num_episodes} episodes on test sets; {_trainers.describe(trainer)}",
+    )
 
 
 def main() -> None:
-    report = m.Report("training")
-    trainer = _trainers.make_trainer()
-    state = _trainers.trained_state(trainer, num_updates=2)
-    timings = m.measure(subjects_of(trainer, state), m.REPEATS.value)
-    report_timings(report, trainer, timings)
-    report_shares(report, timings)
-    report_floor(report, trainer, timings["update"])
+    report = m.Report("training", ARGUMENTS)
+    trainer = _trainers.make_trainer(report.is_quick)
+    # Two updates, after which episodes no longer start together.
+    state, _ = trainer.chunk(trainer.init(), 2)
+    subjects = {"update": _trainers.updating(trainer, state)}
+    if "rollout" in ARGUMENTS.parts:
+        subjects |= rollout_subjects(trainer, state)
+    if "learning" in ARGUMENTS.parts:
+        subjects |= learning_subjects(trainer, state)
+    if "sets" in ARGUMENTS.parts:
+        subjects |= set_subjects(trainer)
+    timings = report.measure(subjects)
+    report_parts(report, trainer, timings)
+    if "floor" in ARGUMENTS.parts:
+        report_floor(report, trainer, timings["update"])
+    if "evaluation" in ARGUMENTS.parts:
+        report_evaluation(report, trainer, state)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

@@ -5,26 +5,27 @@ python -m experiments.benchmarks.utility
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
-from experiments.pipeline.training import Trainer
 from jaxnew.policy import Categorical, UtilityMethod
 from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
 from jaxnew.policy.utility import Utility
 from jaxnew.ppo import Learner
+from jaxnew.rollout.device import DeviceRollout
+
+ARGUMENTS = m.Benchmark(__doc__)
 
 SET_SIZES = (20, 50, 250)
-SIZES = (0, 64, 128, 256, 512)  # Of microbatches.
-RATIO = "time of the first over time of the second"
-FORMS = ("factored", "concatenated")
+MICROBATCHES = (0, 64, 128, 256, 512)
+# One gradient step a rollout: 32 environments make as many transitions as the minibatch has.
+_ONE_STEP = {"ppo__num_epochs": 1, "ppo__num_minibatches": 1}
 
 
 class GatherThenProject(UtilityMethod):
@@ -61,120 +62,94 @@ METHODS: dict[str, type[UtilityMethod]] = {
 }
 
 
-def layer_subjects(num_states: int, set_size: int, num_actions: int) -> dict[str, m.Subject]:
+def factored(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
+    """Utilities of the layer alone, of the rows of a projected table."""
+    projected = Utility().apply(params, table, method="project")
+    return Utility().apply(params, features, jnp.asarray(projected)[ids])
+
+
+def concatenated(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
+    """The same as the paper writes it."""
+    return Utility().apply(params, features, table[ids], method="concatenated")
+
+
+def with_gradients(forward: Callable[..., Any]) -> Callable[..., Any]:
+    """Also the gradients of parameters and features, for those of the utilities."""
+
+    def both(
+        params: Any, features: jax.Array, table: jax.Array, ids: jax.Array, up: jax.Array
+    ) -> Any:
+        utilities, pull_back = jax.vjp(lambda p, f: forward(p, f, table, ids), params, features)
+        return utilities, pull_back(up)
+
+    return both
+
+
+def report_layer(report: m.Report) -> None:
     """The layer alone, from state features, a table and ids; forward, and with its gradients."""
-    layer: nn.Module = Utility()
-    size = _trainers.REPRESENTATION_SIZE
-
-    def factored(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
-        projected = layer.apply(params, table, method="project")
-        return layer.apply(params, features, jnp.asarray(projected)[ids])
-
-    def concatenated(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
-        return layer.apply(params, features, table[ids], method="concatenated")
-
-    def with_gradients(forward: Callable[..., Any]) -> Callable[..., Any]:
-        def both(
-            params: Any, features: jax.Array, table: jax.Array, ids: jax.Array, up: jax.Array
-        ) -> Any:
-            utilities, pull_back = jax.vjp(lambda p, f: forward(p, f, table, ids), params, features)
-            return utilities, pull_back(up)
-
-        return both
+    num_states, set_size, num_actions = (16, 5, 32) if report.is_quick else (4096, 50, 1024)
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
         keys = jax.random.split(key, 5)
         features = jnp.tanh(jax.random.normal(keys[0], (num_states, FEATURE_SIZE)))
-        table = jax.random.normal(keys[1], (num_actions, size))
+        table = jax.random.normal(keys[1], (num_actions, _trainers.REPRESENTATION_SIZE))
         ids = jax.random.randint(keys[2], (num_states, set_size), 0, num_actions)
-        params = layer.init(keys[3], features[0], table[:1], method="concatenated")
+        params = Utility().init(keys[3], features[0], table[:1], method="concatenated")
         return params, features, table, ids, jax.random.normal(keys[4], ids.shape)
 
-    subjects = {}
-    for name, forward in (("factored", factored), ("concatenated", concatenated)):
-        subjects[f"{name}, forward"] = m.compiled(forward, lambda key: inputs(key)[:4])
-        subjects[f"{name}, forward and backward"] = m.compiled(with_gradients(forward), inputs)
-    return subjects
-
-
-def gradient_subjects(
-    trainer: Trainer,
-    variants: Mapping[str, tuple[UtilityMethod, int]],
-    num_transitions: int,
-) -> dict[str, m.Subject]:
-    """The learner's gradient of one minibatch, for each name -> (method, microbatch size)."""
-    rollout = trainer.learner.rollout
-    rollout_config = replace(rollout.config, num_envs=1, num_steps=num_transitions)
-    params = jax.jit(trainer.learner.init)(
-        jax.random.key(0), trainer.table, trainer.pools["train"]
-    ).params
-    minibatch = jax.jit(lambda key: _trainers.random_minibatch(key, trainer, num_transitions))
-
-    def inputs(key: jax.Array) -> tuple[Any, ...]:
-        return params, minibatch(key), trainer.config.hyperparameters, trainer.table
-
-    def learner(method: UtilityMethod, microbatch_size: int) -> Learner:
-        config = replace(
-            trainer.config.ppo,
-            rollout=rollout_config,
-            num_minibatches=1,
-            microbatch_size=microbatch_size,
-        )
-        return Learner(replace(rollout, method=method, config=rollout_config), config)
-
-    return {
-        name: m.compiled(learner(*variant)._gradient, inputs) for name, variant in variants.items()
-    }
-
-
-def report_layer(report: m.Report) -> None:
-    num_states, set_size, num_actions = (16, 5, 32) if m.QUICK.value else (4096, 50, 1024)
-    timings = m.measure(layer_subjects(num_states, set_size, num_actions), m.REPEATS.value)
+    forms = {"factored": factored, "concatenated": concatenated}
+    both = "forward and backward"
+    timings = report.measure(
+        {f"{k}, forward": m.compiled(v, lambda key: inputs(key)[:4]) for k, v in forms.items()}
+        | {f"{k}, {both}": m.compiled(with_gradients(v), inputs) for k, v in forms.items()}
+    )
     for name, timing in timings.items():
         how = f"B = {num_states}, m = {set_size}, A = {num_actions}; whole batch at once"
         report.timing(f"layer {name}", timing, work={"states": num_states}, how=how)
-    for direction in ("forward", "forward and backward"):
-        slow, fast = (timings[f"{form}, {direction}"] for form in reversed(FORMS))
-        report.values(f"concatenated / factored, {direction}", m.ratio(slow, fast), how=RATIO)
+    for direction in ("forward", both):
+        slow, fast = (timings[f"{form}, {direction}"] for form in ("concatenated", "factored"))
+        report.ratio(f"concatenated / factored, {direction}", slow, fast)
 
 
-def report_microbatches(report: m.Report) -> None:
-    num_transitions, sizes, default = (32, (0, 8), 8) if m.QUICK.value else (4096, SIZES, 256)
-    trainer = _trainers.make_trainer()
-    variants = {str(size): (UtilityMethod(), size) for size in sizes}
-    timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
-    shapes = f"minibatch of {num_transitions}, 0: undivided; {_trainers.describe(trainer)}"
+def report_steps(
+    report: m.Report, variants: dict[str, tuple[UtilityMethod, int]], base: str, **changes: int
+) -> None:
+    """A gradient step with each name -> (method, microbatch size), against that of `base`."""
+    trainer = _trainers.make_trainer(report.is_quick, **_ONE_STEP, **changes)
+    state, rollout, ppo = trainer.init(), trainer.rollout, trainer.config.ppo
+    assert isinstance(rollout, DeviceRollout)
+    timings = report.measure(
+        {
+            name: _trainers.learning(
+                trainer,
+                state,
+                Learner(replace(rollout, method=method), replace(ppo, microbatch_size=size)),
+            )
+            for name, (method, size) in variants.items()
+        }
+    )
     for name, timing in timings.items():
-        work = {"transitions": num_transitions}
-        report.timing(f"gradient, microbatches of {name}", timing, work=work, how=shapes)
+        work, how = {"transitions": ppo.steps_per_update}, _trainers.describe(trainer)
+        report.timing(f"gradient step, {name}", timing, work=work, how=how)
     for name, timing in timings.items():
-        values = m.ratio(timing, timings[str(default)])
-        report.values(f"microbatches of {name} / of {default}", values, how=RATIO)
-
-
-def report_projection(report: m.Report) -> None:
-    """Forms of the layer within the learner's gradient; small minibatches keep m = 250 short."""
-    num_transitions, size = (16, 8) if m.QUICK.value else (2048, 128)
-    variants = {name: (method(), size) for name, method in METHODS.items()}
-    for set_size in (5,) if m.QUICK.value else SET_SIZES:
-        trainer = _trainers.make_trainer(set_size)
-        timings = m.measure(gradient_subjects(trainer, variants, num_transitions), m.REPEATS.value)
-        how = f"minibatch of {num_transitions}, microbatches of {size}, m = {set_size}"
-        for name, timing in timings.items():
-            work = {"transitions": num_transitions}
-            report.timing(f"gradient, {name}, m = {set_size}", timing, work=work, how=how)
-        first, *others = METHODS
-        for name in others:
-            values = m.ratio(timings[name], timings[first])
-            report.values(f"({name}) / ({first}), m = {set_size}", values, how=RATIO)
+        if name != base:
+            report.ratio(f"({name}) / ({base})", timing, timings[base])
 
 
 def main() -> None:
-    report = m.Report("utility")
+    report = m.Report("utility", ARGUMENTS)
     report_layer(report)
-    report_microbatches(report)
-    report_projection(report)
+    sizes, default = ((0, 8), 8) if report.is_quick else (MICROBATCHES, 256)
+    of_size = {f"microbatches of {size}": (UtilityMethod(), size) for size in sizes}
+    report_steps(report, of_size, f"microbatches of {default}", ppo__rollout__num_steps=128)
+    for set_size in (5,) if report.is_quick else SET_SIZES:  # Fewer steps keep m = 250 short.
+        forms = {
+            f"{k}, m = {set_size}": (method(), 8 if report.is_quick else 128)
+            for k, method in METHODS.items()
+        }
+        changes = {"sets__size": set_size, "ppo__rollout__num_steps": 64}
+        report_steps(report, forms, next(iter(forms)), **changes)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)
