@@ -17,7 +17,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from absl import flags
 
 from envs_host.create import CreateConfig, CreateEnv
 from envs_host.create.config import Observation
@@ -26,7 +25,8 @@ from envs_host.create.stage import Stage
 from envs_host.create.tools import all_tools
 from experiments.benchmarks import _measure as m
 
-LEVELS = flags.DEFINE_list("levels", ["Push", "Obstacle"], "What is played.")
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define("list", "levels", ["Push", "Obstacle"], "What is played.")
 
 SUBSTEPS = CreateConfig().physics.substeps
 _DRAWN: tuple[Observation, ...] = ("gray", "rgb")
@@ -95,9 +95,7 @@ def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
     """Random play of one level with gray, RGB and no observations, and the share of the physics."""
     names: tuple[Observation, ...] = (*_DRAWN, "none")
     envs = {name: CreateEnv(level, config=CreateConfig(observation=name)) for name in names}
-    timings = m.measure(
-        {name: _subject(env, num_decisions) for name, env in envs.items()}, m.REPEATS.value
-    )
+    timings = report.measure({name: _subject(env, num_decisions) for name, env in envs.items()})
     for name, timing in timings.items():
         report.timing(
             f"{level}, observation {name}",
@@ -132,12 +130,11 @@ def measure_frames(report: m.Report, num_frames: int) -> None:
     """A frame of Push alone, at the start and with ten tools."""
     for num_tools in (0, _NUM_TOOLS):
         world = crowded_env("Push", num_tools).world
-        timings = m.measure(
+        timings = report.measure(
             {
                 mode: m.Subject(_draw_often(world.sprites, mode, num_frames), lambda key: ())
                 for mode in _DRAWN
-            },
-            m.REPEATS.value,
+            }
         )
         for mode, timing in timings.items():
             report.timing(
@@ -158,12 +155,12 @@ def _draw_often(sprites: Callable, mode: str, num_frames: int) -> Callable[[], N
 
 
 def main() -> None:
-    report = m.Report("create")
+    report = m.Report("create", ARGUMENTS)
     report.add_versions("pymunk", "gymnasium")
-    for level in LEVELS.value:
-        measure_play(report, level, 20 if m.QUICK.value else 300)
-    measure_frames(report, 10 if m.QUICK.value else 2000)
+    for level in ARGUMENTS.levels:
+        measure_play(report, level, 20 if report.is_quick else 300)
+    measure_frames(report, 10 if report.is_quick else 2000)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

@@ -20,15 +20,15 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from absl import flags
 
 from envs_mjx.grid_world import GridWorld
 from envs_mjx.grid_world.skills import NUM_MOVES, NUM_SKILLS
 from experiments.benchmarks import _measure as m
 from jaxnew.environment import Action
 
-GAMES = flags.DEFINE_list(
-    "games", ["grid_world", "navix", "xminigrid", "gymnax"], "What to measure."
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define(
+    "list", "games", ["grid_world", "navix", "xminigrid", "gymnax"], "What to measure."
 )
 
 
@@ -184,61 +184,48 @@ def subject(game: Game, num_envs: int, num_steps: int) -> m.Subject:
     return m.compiled(random_play(game, num_steps), inputs)
 
 
-def installed_peers(report: m.Report) -> dict[str, Game]:
-    """The peers that can be imported; a line for each that cannot."""
+def games_of(report: m.Report, names: list[str]) -> dict[str, Game]:
+    """Ours in three forms, and the peers that can be imported; a line for each that cannot."""
     games = {}
-    for name, make in PEERS.items():
-        if name not in GAMES.value:
-            continue
+    if "grid_world" in names:
+        games = {
+            "raw": grid_world(has_auto_reset=False),
+            "auto-reset": grid_world(),
+            "auto-reset, final observation": grid_world(reads_final_observation=True),
+        }
+    for name in [name for name in PEERS if name in names]:
         try:
-            games[name] = make()
+            games[name] = PEERS[name]()
+            report.add_versions(name)
         except ImportError as err:
-            report.note(f"{name} is left out ({err}); to compare with it: pip install {name}")
+            print(f"  {name} is left out ({err}); to compare with it: pip install {name}")
     return games
 
 
 def main() -> None:
-    report = m.Report("environment")
-    peers = installed_peers(report)
-    report.add_versions(*peers)
-    num_steps = 8 if m.QUICK.value else 512
-    for num_envs in (4,) if m.QUICK.value else (32, 1024):
-        games = {}
-        if "grid_world" in GAMES.value:
-            games = {
-                "raw": grid_world(has_auto_reset=False),
-                "auto-reset": grid_world(),
-                "auto-reset, final observation": grid_world(reads_final_observation=True),
-            }
-        games |= peers
-        timings = m.measure(
-            {name: subject(game, num_envs, num_steps) for name, game in games.items()},
-            m.REPEATS.value,
-        )
+    report = m.Report("environment", ARGUMENTS)
+    games = games_of(report, ARGUMENTS.games)
+    num_steps = 8 if report.is_quick else 512
+    for num_envs in (4,) if report.is_quick else (32, 1024):
+        timings = report.measure({k: subject(v, num_envs, num_steps) for k, v in games.items()})
         for name, game in games.items():
             decisions = num_envs * num_steps
             report.timing(
-                name if name in peers else f"grid_world, {name}",
+                name if name in PEERS else f"grid_world, {name}",
                 timings[name],
                 work={"decisions": decisions, "moves": decisions * game.moves_per_decision},
                 num_envs=num_envs,
                 includes=["auto-reset"] * game.has_auto_reset + ["random actions"],
                 how=f"{game.description}; a scan of {num_steps} steps from fresh starts",
             )
-        if "auto-reset" in games:
-            ours = timings["auto-reset"]
-            compare(report, "auto-reset / raw", ours, timings["raw"], num_envs)
-            for name in peers:
-                compare(report, f"{name} / grid_world", timings[name], ours, num_envs)
-
-
-def compare(
-    report: m.Report, case: str, numerator: m.Timing, denominator: m.Timing, num_envs: int
-) -> None:
-    """Records a ratio of two times for the same number of decisions."""
-    how = "time of the first over time of the second, for the same number of decisions"
-    report.values(f"{case}, {num_envs} envs", m.ratio(numerator, denominator), how=how)
+        if "auto-reset" not in games:
+            continue
+        pairs = {"auto-reset / raw": ("auto-reset", "raw")}
+        pairs |= {f"{name} / grid_world": (name, "auto-reset") for name in games if name in PEERS}
+        how = f"{m.RATIO}, for the same number of decisions"
+        for case, (one, other) in pairs.items():
+            report.ratio(f"{case}, {num_envs} envs", timings[one], timings[other], how=how)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

@@ -6,7 +6,6 @@ python -m experiments.benchmarks.pool
 from __future__ import annotations
 
 import contextlib
-import statistics
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -20,6 +19,8 @@ from gymnasium.vector import AsyncVectorEnv
 from envs_host.pool import HostPool
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks._host_toys import Toy
+
+ARGUMENTS = m.Benchmark(__doc__)
 
 FACTORY = "experiments.benchmarks._host_toys:host_toy"
 NUM_WORKERS = (1, 2)
@@ -41,13 +42,14 @@ class Way:
 
 
 def main() -> None:
-    num_envs = 4 if m.QUICK.value else 32
-    num_steps = {EMPTY: 3, WORKING: 3} if m.QUICK.value else {EMPTY: 300, WORKING: 10}
+    is_quick = ARGUMENTS.quick
+    num_envs = 4 if is_quick else 32
+    num_steps = {EMPTY: 3, WORKING: 3} if is_quick else {EMPTY: 300, WORKING: 10}
     work_ms = {EMPTY: 0.0, WORKING: 1.0}
     with contextlib.ExitStack() as stack:
         # Forks one process per environment, which must come before the devices are in use.
         peers = {name: make_peer(stack, num_envs, work) for name, work in work_ms.items()}
-        report = m.Report("pool")
+        report = m.Report("pool", ARGUMENTS)
         report.add_versions("gymnasium")
         for name, work in work_ms.items():
             ways = {LOOP: make_loop(num_envs, work), PEER: peers[name]}
@@ -103,9 +105,9 @@ def compare(
 
         return m.Subject(call, inputs)
 
-    repeats, num_decisions = m.REPEATS.value, num_envs * num_steps
+    num_decisions = num_envs * num_steps
     before = {case: m.cpu_s_of(way.pids) for case, way in ways.items()}
-    timings = m.measure({case: subject(way) for case, way in ways.items()}, repeats)
+    timings = report.measure({case: subject(way) for case, way in ways.items()})
     for case, timing in timings.items():
         report.timing(
             f"{name}, {case}",
@@ -118,8 +120,8 @@ def compare(
     cpu_us = {}
     for case, way in ways.items():
         # The others are idle but for the calls, of which one was not counted.
-        children_s = (m.cpu_s_of(way.pids) - before[case]) / (repeats + 1)
-        cpu_us[case] = 1e6 * (statistics.median(timings[case].cpu_s) + children_s) / num_decisions
+        children_s = (m.cpu_s_of(way.pids) - before[case]) / (report.repeats + 1)
+        cpu_us[case] = 1e6 * (timings[case].median.cpu_s + children_s) / num_decisions
     report_overheads(report, name, timings, cpu_us, num_envs, num_decisions)
 
 
@@ -132,33 +134,27 @@ def report_overheads(
     num_decisions: int,
 ) -> None:
     """What a decision costs beyond the plain loop, and the peer's overhead over the pool's."""
-    wall_us = {
-        case: 1e6 * statistics.median(timing.wall_s) / num_decisions
+    beyond = {
+        case: {
+            "wall_us": 1e6 * (timing.median - timings[LOOP].median).wall_s / num_decisions,
+            "cpu_us": cpu_us[case] - cpu_us[LOOP],
+        }
         for case, timing in timings.items()
+        if case != LOOP
     }
-    how = "microseconds of one decision in one environment beyond those of the plain loop"
-    for case in timings:
-        if case != LOOP:
-            report.values(
-                f"{name}, overhead of {case}",
-                {"wall_us": wall_us[case] - wall_us[LOOP], "cpu_us": cpu_us[case] - cpu_us[LOOP]},
-                how=f"{how}; cpu: of all processes; wall is below zero where processes share work",
-                num_envs=num_envs,
-            )
+    how = (
+        "microseconds of one decision in one environment beyond those of the plain loop; cpu: of "
+        "all processes; wall is below zero where processes share work"
+    )
+    for case, values in beyond.items():
+        report.values(f"{name}, overhead of {case}", values, how=how, num_envs=num_envs)
     if name != EMPTY:  # There the differences are those of the work, not of the overhead.
         return
-    for num_workers in NUM_WORKERS:
-        case = pool_name(num_workers)
-        report.values(
-            f"{name}, overhead of {PEER} / {case}",
-            {
-                clock: (cost[PEER] - cost[LOOP]) / (cost[case] - cost[LOOP])
-                for clock, cost in (("wall", wall_us), ("cpu", cpu_us))
-            },
-            how="cpu is that of all processes, which other load disturbs less",
-            num_envs=num_envs,
-        )
+    how = "cpu is that of all processes, which other load disturbs less"
+    for case in map(pool_name, NUM_WORKERS):
+        values = {clock[:-3]: beyond[PEER][clock] / us for clock, us in beyond[case].items()}
+        report.values(f"{name}, overhead of {PEER} / {case}", values, how=how, num_envs=num_envs)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)
