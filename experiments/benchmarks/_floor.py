@@ -1,8 +1,9 @@
 """The least that a training update can take: operations and bytes over what the machine reaches.
 
-Counted from the shapes of the networks (docs/method.md, "Policy networks") in float32, for a program that never stores
-an [m, 64] array: a true floor, below what a compiler can reach that does not fuse products with
-what surrounds them. Left out: biases, activation functions, environment, random numbers, Adam.
+Counted from the shapes of the networks (docs/method.md, "Policy networks") in float32, for a
+program that never stores an [m, 64] array: a true floor, below what a compiler can reach that does
+not fuse products with what surrounds them. Left out: biases, activations, environment, random
+numbers, Adam.
 """
 
 from __future__ import annotations

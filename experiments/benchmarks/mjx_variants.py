@@ -19,7 +19,6 @@ from unittest import mock
 import jax
 import jax.numpy as jnp
 import numpy as np
-from absl import flags
 
 from envs_mjx.shape_stacking import hulls, rules, scene, shape_library
 from envs_mjx.shape_stacking.engines import Settled
@@ -30,17 +29,19 @@ from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from envs_mjx.shape_stacking.polyhedra import Polyhedron, prism, pyramid
 from envs_mjx.shape_stacking.scene import Solver
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from envs_mjx.shape_stacking.solids import DOME_AXIS_HEIGHT, solids
-from experiments import stacking_figures as figures
 from experiments.benchmarks import _measure as m
 from experiments.untrained import towers as stacking
 from jaxnew.storage.run_directory import describe_session
 
-WORLDS = flags.DEFINE_integer("worlds", 6, "Worlds of each stage of random play.", lower_bound=1)
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define("integer", "worlds", 6, "Worlds of each stage of random play.", lower_bound=1)
+
 _STAGES = (4, 7, 10)
 _SEED = 5
 _SAME_M = 0.01
-_QUIET = 0.05  # m/s and rad/s: the release's own, for a stop that never came (spec 4, item 4).
+_QUIET = 0.05  # m/s and rad/s: the release's own, for a stop that never came.
 
 State = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -148,16 +149,18 @@ class Scenes:
 def scenes(worlds: int, steps: int) -> Scenes:
     """Random play on C, each world stopped when a shape has just been let go."""
     engine = MujocoC(steps, has_multiple_contacts=True)
-    parts = []
+    parts, sets, starts = [], [], []
+    for i in range(worlds):
+        rng = np.random.default_rng([_SEED, i])
+        sets.append(rng.choice(NUM_SHAPES, 20, replace=False))
+        cylinder = rng.choice(rules.START_CYLINDERS)
+        starts.append((cylinder, rng.uniform(*rules.START_CENTER), rng.uniform(*rules.START_GAP)))
     for stage in _STAGES:
-        starts = [figures.draw_start(np.random.default_rng([_SEED, i])) for i in range(worlds)]
-        bodies = stacking.start_scenes(
-            [s.cylinder_id for s in starts], [s.center for s in starts], [s.gap for s in starts]
-        )
+        bodies = stacking.start_scenes(*zip(*starts, strict=True))
         drops = []
-        for i, start in enumerate(starts):
+        for i, available in enumerate(sets):
             rng = np.random.default_rng([_SEED, stage, i])
-            ids = rng.permutation(start.action_set)[:stage]
+            ids = rng.permutation(available)[:stage]
             drops.append([(int(k), float(rng.uniform(-1.0, 1.0))) for k in ids])
         bodies = stacking.stack(engine, bodies, [row[:-1] for row in drops])
         parts.append(_let_go(bodies, stage + 1, [row[-1] for row in drops]))
@@ -240,13 +243,13 @@ HEADER = (
 
 
 def main() -> None:
-    steps, worlds = (5, 2) if m.QUICK.value else (scene.SETTLE_STEPS, WORLDS.value)
+    steps, worlds = (5, 2) if ARGUMENTS.quick else (scene.SETTLE_STEPS, ARGUMENTS.worlds)
     at = scenes(worlds, steps)
     rows = [
         in_c("C, several contacts, starts off by 1e-5 m", at, steps, True, 1e-5),
         in_c("C, one contact of two hulls", at, steps, False, 0.0),
     ]
-    variants = _variants()[:1] if m.QUICK.value else _variants()
+    variants = _variants()[:1] if ARGUMENTS.quick else _variants()
     rows += [measured(variant, at, steps) for variant in variants]
     session = describe_session()
     print("# Shape Stacking: the MJX engine's speed and what it hangs on\n")
@@ -255,7 +258,7 @@ def main() -> None:
     count = len(at.state[0])
     print(f"{count} worlds of 12 slots, {steps} steps; {count - len(at.rests)} of random play.")
     print("Processor time of all threads; other work may have run on the machine.\n")
-    print(figures.table(HEADER, rows))
+    print(m.markdown(HEADER, rows))
     print(
         "\nHeights: mean over random play and its standard error. Steps until all bodies of such a"
     )
@@ -265,4 +268,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

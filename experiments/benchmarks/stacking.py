@@ -18,7 +18,6 @@ import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
-from absl import flags
 from jax.experimental.compilation_cache import compilation_cache
 
 from envs_mjx.shape_stacking import rules, scene
@@ -30,13 +29,13 @@ from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from experiments.benchmarks import _measure as m
 from experiments.untrained import towers as stacking
 
-ENGINES = flags.DEFINE_list("engines", ["mujoco", "mjx"], "Which engines.")
-MJX_WORLDS = flags.DEFINE_list("mjx_worlds", ["1", "20", "60"], "Worlds per call of MJX.")
-MJX_STEPS = flags.DEFINE_integer("mjx_steps", 60, "Physics steps of a call.", lower_bound=1)
+ARGUMENTS = m.Benchmark(__doc__)
+ARGUMENTS.define("list", "engines", ["mujoco", "mjx"], "Which engines.")
+ARGUMENTS.define("list", "mjx_worlds", ["1", "20", "60"], "Worlds per call of MJX.")
+ARGUMENTS.define("integer", "mjx_steps", 60, "Physics steps of a call of MJX.", lower_bound=1)
 
 _SEED = 7
 _TOWERS = 20
-RATIO = "time of the first over time of the second, both on one core"
 
 
 def towers(engine: Engine, count: int) -> tuple[Bodies, np.ndarray, np.ndarray]:
@@ -84,7 +83,7 @@ Inputs = Callable[[jax.Array], tuple[jax.Array, jax.Array, jax.Array]]
 
 def placements(num_worlds: int) -> Inputs:
     """Worlds at all stages of an episode in which a shape has just been let go, by key."""
-    before = MujocoC(5 if m.QUICK.value else scene.SETTLE_STEPS)
+    before = MujocoC(5 if ARGUMENTS.quick else scene.SETTLE_STEPS)
     bodies, slots, ids = towers(before, min(num_worlds, _TOWERS))
     repeated = np.arange(num_worlds) % len(ids)
     bodies = jax.tree.map(lambda x: jnp.asarray(x)[repeated], bodies)
@@ -99,11 +98,11 @@ def placements(num_worlds: int) -> Inputs:
     return inputs
 
 
-def report_all(
-    report: m.Report, timings: dict[str, m.Timing], num_worlds: int, num_steps: int
+def compare(
+    report: m.Report, subjects: dict[str, m.Subject], num_worlds: int, num_steps: int
 ) -> None:
-    """One line for each timing."""
-    steps = num_worlds * num_steps
+    """A line for each, and the ratio of the first two."""
+    timings, steps = report.measure(subjects), num_worlds * num_steps
     for name, timing in timings.items():
         report.timing(
             f"{num_worlds} worlds, {name}",
@@ -112,70 +111,67 @@ def report_all(
             num_envs=num_worlds,
             how=f"2 to 11 bodies and a new one, {num_steps} steps of 0.01 s each",
         )
+    one, other, *_ = timings
+    report.ratio(f"{num_worlds} worlds, {one} / {other}", timings[one], timings[other])
 
 
-def compare(report: m.Report, num_worlds: int, num_steps: int) -> None:
+def compare_c(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """Placements in one compiled program, on one core and on all, and the bare loop."""
-    engines = {"one core": MujocoC(num_steps, num_threads=1), "all cores": MujocoC(num_steps)}
     inputs = placements(num_worlds)
     loop = bare_loop(np.asarray(inputs(jax.random.key(0))[0]), num_steps)
-    subjects = {name: m.compiled(engine.settle, inputs) for name, engine in engines.items()}
-    subjects["bare loop"] = m.Subject(
-        lambda _, qpos, qvel: loop(np.asarray(qpos), np.asarray(qvel)), inputs
-    )
-    timings = m.measure(subjects, m.REPEATS.value)
-    report_all(report, timings, num_worlds, num_steps)
-    share = m.ratio(timings["bare loop"], timings["one core"])
-    report.values(f"{num_worlds} worlds, bare loop / one core", share, how=RATIO)
+    one, every = MujocoC(num_steps, num_threads=1), MujocoC(num_steps)
+    subjects = {
+        "bare loop": m.Subject(
+            lambda _, qpos, qvel: loop(np.asarray(qpos), np.asarray(qvel)), inputs
+        ),
+        "one core": m.compiled(one.settle, inputs),
+        "all cores": m.compiled(every.settle, inputs),
+    }
+    compare(report, subjects, num_worlds, num_steps)
 
 
 def compare_mjx(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """MJX on the device that jax has, against the C engine on one core."""
     inputs = placements(num_worlds)
+    mjx, in_c = make_engine("mjx", settle_steps=num_steps), MujocoC(num_steps, num_threads=1)
     subjects = {
-        "MJX": m.compiled(make_engine("mjx", settle_steps=num_steps).settle, inputs),
-        "C, one core": m.compiled(MujocoC(num_steps, num_threads=1).settle, inputs),
+        "MJX": m.compiled(mjx.settle, inputs),
+        "C on one core": m.compiled(in_c.settle, inputs),
     }
-    timings = m.measure(subjects, m.REPEATS.value)
-    report_all(report, timings, num_worlds, num_steps)
-    times = m.ratio(timings["MJX"], timings["C, one core"])
-    report.values(f"{num_worlds} worlds, MJX / C on one core", times, how=RATIO)
+    compare(report, subjects, num_worlds, num_steps)
 
 
 def cached_compilation(report: m.Report, num_worlds: int, num_steps: int) -> None:
     """What a second process would wait for, with a compilation cache on disk."""
     arguments = placements(num_worlds)(jax.random.key(0))
-    costs = []
     with tempfile.TemporaryDirectory() as folder:
         jax.config.update("jax_enable_compilation_cache", True)
         jax.config.update("jax_compilation_cache_dir", folder)
-        for _ in range(2):
+        for name in ("cold", "from the cache"):
             jax.clear_caches()
             compilation_cache.reset_cache()  # It remembers that it was off.
             program = jax.jit(make_engine("mjx", settle_steps=num_steps).settle)
             lowered, tracing = m.timed(partial(program.lower, *arguments))
-            costs.append((tracing, m.timed(lowered.compile)[1]))
+            compilation = m.timed(lowered.compile)[1]
+            values = {"tracing cpu-s": tracing.cpu_s, "compilation cpu-s": compilation.cpu_s}
+            report.values(f"MJX program, {num_worlds} worlds, {name}", values, how="one settling")
         jax.config.update("jax_enable_compilation_cache", False)
-    for name, (tracing, compilation) in zip(("cold", "from the cache"), costs, strict=True):
-        values = {"tracing cpu-s": tracing.cpu_s, "compilation cpu-s": compilation.cpu_s}
-        report.values(f"MJX program, {num_worlds} worlds, {name}", values, how="of one settling")
 
 
 def main() -> None:
-    report = m.Report("stacking")
+    report = m.Report("stacking", ARGUMENTS)
     report.add_versions("mujoco", "mujoco-mjx")
-    num_steps = 5 if m.QUICK.value else scene.SETTLE_STEPS
-    if "mujoco" in ENGINES.value:
-        for num_worlds in (2,) if m.QUICK.value else (1, 20, 60):
-            compare(report, num_worlds, num_steps)
-    if "mjx" in ENGINES.value:
-        num_steps = 5 if m.QUICK.value else MJX_STEPS.value
-        worlds = [2] if m.QUICK.value else [int(number) for number in MJX_WORLDS.value]
+    if "mujoco" in ARGUMENTS.engines:
+        for num_worlds in (2,) if report.is_quick else (1, 20, 60):
+            compare_c(report, num_worlds, 5 if report.is_quick else scene.SETTLE_STEPS)
+    if "mjx" in ARGUMENTS.engines:
+        num_steps = 5 if report.is_quick else ARGUMENTS.mjx_steps
+        worlds = [2] if report.is_quick else [int(number) for number in ARGUMENTS.mjx_worlds]
         for num_worlds in worlds:
             compare_mjx(report, num_worlds, num_steps)
-        if not m.QUICK.value:
+        if not report.is_quick:
             cached_compilation(report, worlds[0], num_steps)
 
 
 if __name__ == "__main__":
-    m.run_benchmark(main)
+    ARGUMENTS.start(main)

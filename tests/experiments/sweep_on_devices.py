@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from functools import partial
 
 import jax
 import numpy as np
 
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.flags import load_task
-from experiments.pipeline.training import TrainConfig, Trainer
-from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import engineered_table
+from jaxnew.sweeping import SweepProgram, member_configs
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.trainer import Trainer
+from jaxnew.training import train_config
 
 
 def distance(tree: object, other: object) -> float:
@@ -34,28 +33,25 @@ def opinionated(state: TrainState) -> TrainState:
 
 
 def main() -> None:
-    domain = Domain.of(load_task("grid_world"), None)
+    domain = Domain.of(load_task("grid_world"))
     table = engineered_table(domain.universe, "gt12")
-    budget = domain.task.stage_two["smoke"]
-    base = TrainConfig.of(domain, "ours", "gt12", table, budget, 31)
-    configs = member_configs(base, list(range(8)), ["entropy_coefficient=0.0,0.1"])
+    base = train_config(domain, "ours", "gt12", table, domain.task.budget("smoke"), 31)
+    configs = member_configs(base, list(range(8)), {"entropy_coefficient": [0.0, 0.1]})
     trainer = Trainer.of(configs[0], domain.task, domain.split, table)
+    learner, actions = trainer.learner, trainer.training
     # As `Trainer` does it; one compilation serves all, for seeds and hyper-parameters are traced.
-    init = jax.jit(trainer.learner.init)
-    update = jax.jit(partial(trainer.learner.updates, num_updates=1))
-    pool = trainer.pools["train"]
     singles = [
-        update(
-            opinionated(init(jax.random.key(config.seed), trainer.table, pool)),
+        learner.compiled_updates(
+            opinionated(learner.compiled_init(jax.random.key(config.seed), actions)),
             config.hyperparameters,
-            trainer.table,
-            pool,
+            actions,
+            num_updates=1,
         )
         for config in configs
     ]
     errors: dict[int, list[float]] = {1: [], 2: []}
     for members_at_once in errors:
-        sweep = Sweep.of(trainer, configs, jax.devices(), members_at_once)
+        sweep = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
         started = sweep.init()
         started = replace(started, members=opinionated(started.members))
         state, metrics = sweep.chunk(started, 1)
@@ -71,7 +67,8 @@ def main() -> None:
                 metrics[f"{index:03d}/{name}"], float(single_metrics[name]), rtol=1e-5
             )
     leaf = jax.tree.leaves(state.members.params)[0]
-    seven = Sweep.of(trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6])
+    sevens = [replace(base, seed=seed) for seed in range(7)]
+    seven = SweepProgram.of(trainer, sevens, jax.devices()[:6])
     print(
         json.dumps(
             {
