@@ -21,9 +21,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action, ActionSpec
-from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Beta, Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, apply, orthogonal_dense
+from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, apply, orthogonal_dense
 from jaxnew.policy.utility import HIDDEN_SIZE, UtilityMethod
 from jaxnew.sampling import AvailableSet
 

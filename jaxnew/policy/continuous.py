@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action
-from jaxnew.policy._features import FeatureMethod
-from jaxnew.policy._nearest import nearest_id
-from jaxnew.policy.state_encoder import StateEncoder, apply, orthogonal_dense
+from jaxnew.policy.distributions import nearest_id
+from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
 _LOG_TWO_PI = 1.8378770664093453

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnew._convolution import WINDOW, convolution
+from jaxnew.convolution import WINDOW, convolution
 
 FEATURE_SIZE = 64  # Width of the state feature f(s).
 _SQRT_2 = float(np.sqrt(2.0))
@@ -50,7 +50,7 @@ class StridedConvolution(nn.Module):
 
     Attributes:
       features: O.
-      form: of `jaxnew._convolution`.
+      form: of `jaxnew.convolution`.
     """
 
     features: int
@@ -78,7 +78,7 @@ class ImageEncoder(nn.Module):
     the dense layer's weight and changes nothing else.
 
     Attributes:
-      form: of the convolutions, see `jaxnew._convolution`.
+      form: of the convolutions, see `jaxnew.convolution`.
     """
 
     form: Callable[[jax.Array, jax.Array, int], jax.Array] = convolution
@@ -131,3 +131,55 @@ class StateCritic(nn.Module):
 def apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:
     """The output of `module` with `params`."""
     return cast(jax.Array, module.apply({"params": params}, *inputs, **options))
+
+
+class FeatureMethod:
+    """Base of methods that have `features` and `distribution_of`, and keep a critic's parameters in
+    `params["critic"]`."""
+
+    _critic = StateCritic()
+
+    def init_critic(self, key: jax.Array, obs: jax.Array) -> Any:
+        """Fresh parameters of the critic; consumes `key`."""
+        return self._critic.init(key, obs, jnp.zeros(FEATURE_SIZE))["params"]
+
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature."""
+        raise NotImplementedError
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Any:
+        """`distribution` from the state feature f32[..., 64]."""
+        raise NotImplementedError
+
+    def distribution(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Any:
+        """What is sampled from; see `jaxnew.policy.method.PolicyMethod`.
+
+        Args:
+          params: as `init` makes them.
+          obs: f32[..., n] normalised observations, or uint8[..., H, W, C] images.
+          projected: `project` of the available representations, [..., m, p].
+          mask: bool[..., m] true for a real entry of the set.
+        """
+        return self.distribution_of(params, self.features(params, obs), projected, mask)
+
+    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[...] values of observations, as in `distribution`."""
+        return self.value_of(params, obs, self.features(params, obs))
+
+    def value_of(self, params: dict[str, Any], obs: jax.Array, features: jax.Array) -> jax.Array:
+        """`value` where the state feature is known."""
+        return apply(self._critic, params["critic"], obs, features)
+
+    def distribution_and_value(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        """Both; of images with one pass, and one backward pass, through the trunk they share."""
+        if not is_image(obs):
+            return self.distribution(params, obs, projected, mask), self.value(params, obs)
+        features = self.features(params, obs)
+        distribution = self.distribution_of(params, features, projected, mask)
+        return distribution, self.value_of(params, obs, features)

@@ -20,9 +20,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxnew.environment import Action
-from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, StateEncoder, apply
+from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 HIDDEN_SIZE = 64

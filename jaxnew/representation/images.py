@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew._convolution import WINDOW, convolution
+from jaxnew.convolution import WINDOW, convolution
 from jaxnew.representation.decoders import TrajectoryDecoder
 from jaxnew.representation.encoders import Dense, ResBlock, TrajectoryEncoder, uniform_within
 

@@ -11,7 +11,6 @@ import numpy as np
 import optax
 from flax import struct
 
-from jaxnew.representation._models import build_model
 from jaxnew.representation.batches import Choice, flat_vae_choice, hvae_choice
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
@@ -24,6 +23,7 @@ from jaxnew.representation.objective import (
     weighted_loss,
 )
 from jaxnew.representation.sources import RecordingSource, padded_chunks
+from jaxnew.representation.vae import build_model
 
 __all__ = ["Modality", "RepresentationConfig", "RepresentationLearner", "RepresentationState"]
 

@@ -2,22 +2,27 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.decoders import DecoderStart
 from jaxnew.representation.encoders import (
     Dense,
     LatentHead,
     likelihood_log_variance,
 )
+from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.images import (
     decoded,
     encoded,
     recording_decoder,
     recording_encoder,
 )
+from jaxnew.representation.modality import Modality
 from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
 
 
@@ -105,3 +110,20 @@ class FlatVAE(nn.Module):
         mean, log_variance = self.inference(encoded(self.encoder, features, False)[0], False)
         mean = jnp.mean(mean, axis=-1).T
         return mean, jnp.broadcast_to(log_variance, mean.shape)
+
+
+def build_model(config: RepresentationConfig, modality: Modality) -> HVAE | FlatVAE:
+    """The network for a modality's features: what `config.kind` names, with the config's widths."""
+    shared: dict[str, Any] = {
+        "encoder_width": config.encoder_width,
+        "hidden_width": config.hidden_width,
+        "observation_latent": config.observation_latent,
+        "gaussian_dim": modality.gaussian_dim,
+        "image_shape": modality.image_shape,
+        "is_still": modality.is_still,
+    }
+    if config.kind == "vae":
+        return FlatVAE(**shared)
+    return HVAE(
+        inference_width=config.inference_width, action_latent=config.action_latent, **shared
+    )

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxnew._convolution import convolution_by_columns, convolution_by_xla
+from jaxnew.convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.environment import ActionSpec
 from jaxnew.policy import distribution_and_value, make_method
 from jaxnew.policy.method import MethodContext
