@@ -1,4 +1,7 @@
-"""A discrete policy over the train actions; elsewhere the nearest action acts (spec method 8.2)."""
+"""A discrete policy over the train actions; elsewhere the nearest action acts.
+
+`docs/method.md`, "Baselines and ablations".
+"""
 
 from __future__ import annotations
 
@@ -14,7 +17,7 @@ from jaxnew.policy.distributions import Categorical, nearest_id
 from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
-_HEAD_GAIN = 0.01  # Spec method 8.2.
+_HEAD_GAIN = 0.01
 
 
 class _DiscretePolicy(nn.Module):

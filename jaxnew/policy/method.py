@@ -23,7 +23,7 @@ class Distribution(Protocol):
     """A distribution over samples; a sample is a pytree, stored as it is by PPO.
 
     `entropy` is given the sample that was drawn: a part that is conditioned on another has the
-    entropy that it has there (spec method 5.5).
+    entropy that it has there.
     """
 
     def sample(self, key: jax.Array) -> Any: ...
@@ -82,9 +82,9 @@ class MethodContext:
     Attributes:
       train_ids: int32[n] ids of the fixed action space of a discrete policy.
       sums_gaussian_entropy: whether the entropy of a continuous output is summed over its
-        dimensions, as in Grid World, or averaged, as elsewhere (spec method 8.1).
+        dimensions, as in Grid World, or averaged, as elsewhere.
       action_spec: of the domain; what comes with a choice there gets heads. None: nothing does.
-      conditions_position: the position's head reads the chosen action too (spec method 5.5).
+      conditions_position: the position's head reads the chosen action too.
     """
 
     train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -111,7 +111,7 @@ def make_method(name: str, context: MethodContext | None = None) -> PolicyMethod
         raise ValueError(f"Unknown method {name!r}; choose one of {sorted(METHODS)}.")
     context = context or MethodContext()
     method = METHODS[name](context)
-    spec = context.action_spec
-    if context.conditions_position or (spec and (spec.position_dim or spec.has_stop)):
-        return AuxiliaryMethod(method, spec or ActionSpec(0), context.conditions_position)
+    actions = context.action_spec or ActionSpec(0)
+    if context.conditions_position or actions.position_dim or actions.has_stop:
+        return AuxiliaryMethod(method, actions, context.conditions_position)
     return method

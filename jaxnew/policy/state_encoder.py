@@ -1,4 +1,4 @@
-"""State features and values (spec method 5.2), for vectors and for images.
+"""State features and values, for vectors and for images (`docs/method.md`, "Policy networks").
 
 Which of the two an observation is shows in its dtype: `uint8` is an image. Images stay `uint8` in
 rollouts and are divided by 255 here.
@@ -46,7 +46,7 @@ def orthogonal_dense(features: int, gain: float, name: str | None = None) -> nn.
 class StridedConvolution(nn.Module):
     """A 3x3 convolution with stride 2, padding 1 and a bias; PyTorch's default initialisation.
 
-    Weights and bias are uniform in +-1/sqrt(9 C) (spec method 5.2).
+    Weights and bias are uniform in +-1/sqrt(9 C).
 
     Attributes:
       features: O.
@@ -118,7 +118,7 @@ class StateCritic(nn.Module):
     """The value f32[...] of a state. Blind to the action set.
 
     Of vectors by an encoder of its own; of images from the state feature of the policy, which its
-    gradient reaches (spec method 5.2).
+    gradient reaches.
     """
 
     @nn.compact

@@ -1,4 +1,7 @@
-"""The flat VAE baseline: every recording on its own, no action latent (spec method 4)."""
+"""The flat VAE baseline: every recording on its own, no action latent.
+
+`docs/method.md`, "Flat VAE".
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gauss
 
 
 class FlatInference(nn.Module):
-    """`q(z | o)` of the flat VAE (spec method 4).
+    """`q(z | o)` of the flat VAE.
 
     Attributes:
       width: H.
@@ -47,8 +50,7 @@ class FlatInference(nn.Module):
 class FlatVAE(nn.Module):
     """The flat VAE: encoder, `q(z | o)`, decoder, prior N(0, I).
 
-    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation
-    (spec method 4).
+    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation.
 
     Attributes:
       encoder_width: E.
@@ -99,7 +101,7 @@ class FlatVAE(nn.Module):
         )
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """An action's representation, with running averages (spec method 4).
+        """An action's representation, with running averages.
 
         Args:
           features: f32[B, S, T, D].

@@ -108,10 +108,9 @@ def test_flat_vae_batches_pool_all_actions_with_replacement():
 @pytest.mark.unit
 def test_flat_vae_draws_as_many_recordings_as_divide_evenly():
     config = learner.RepresentationConfig(kind="vae")
-    stage1 = learner.RepresentationLearner(config, XY)
-    assert stage1._flat_batch_size(512) == 86_016  # Spec method 4, Grid World.
+    assert batches.Batches.of(config, XY).pooled_size(512) == 86_016  # Grid World.
     create = dataclasses.replace(config, recordings_per_action=464)
-    assert learner.RepresentationLearner(create, XY)._flat_batch_size(1098) == 59_292  # CREATE.
+    assert batches.Batches.of(create, XY).pooled_size(1098) == 59_292  # CREATE.
 
 
 @pytest.mark.property
