@@ -85,6 +85,7 @@ class ImageEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
+        """State features f32[..., 64] of images uint8[..., H, W, C]."""
         x = obs.reshape(-1, *obs.shape[-3:]).astype(jnp.float32) / 255.0
         for index, channels in enumerate(_CHANNELS):
             x = nn.relu(StridedConvolution(channels, self.form, name=f"convolution_{index}")(x))
@@ -156,14 +157,7 @@ class FeatureMethod:
     def distribution(
         self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Any:
-        """What is sampled from; see `jaxnew.policy.method.PolicyMethod`.
-
-        Args:
-          params: as `init` makes them.
-          obs: f32[..., n] normalised observations, or uint8[..., H, W, C] images.
-          projected: `project` of the available representations, [..., m, p].
-          mask: bool[..., m] true for a real entry of the set.
-        """
+        """See `jaxnew.policy.method.PolicyMethod`."""
         return self.distribution_of(params, self.features(params, obs), projected, mask)
 
     def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:

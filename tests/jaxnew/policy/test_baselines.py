@@ -1,4 +1,4 @@
-"""The paper's baselines (spec method 8.1, 8.2) and random play behind the interface of ours."""
+"""The paper's baselines and random play behind the interface of ours."""
 
 from __future__ import annotations
 

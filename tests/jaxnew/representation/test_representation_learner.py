@@ -435,7 +435,7 @@ def _leaves(params):
 
 
 def _check_lstms(params):
-    """All LSTM weights and both biases are uniform in +-1 / sqrt(hidden) (spec method 3.1)."""
+    """All LSTM weights and both biases are uniform in +-1 / sqrt(hidden)."""
     tree = dict(_leaves(params))
     hidden_kernels = [path for path in tree if path[-1] == "kernel_hidden"]
     assert len(hidden_kernels) == 5  # Two directions in two layers, and the decoder.
