@@ -31,7 +31,7 @@ class Distribution(Protocol):
         ...
 
     def entropy(self, sample: Any = None) -> jax.Array:
-        """f32[...] nats; of a part that is conditioned on another, those that it has at `sample`."""
+        """f32[...] nats; a part that is conditioned on another has those at `sample`."""
         ...
 
     def mode(self) -> Any:
