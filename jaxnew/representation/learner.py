@@ -226,8 +226,10 @@ class RepresentationLearner:
     def _update(
         self, state: RepresentationState, recordings: jax.Array
     ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step; metrics of this step."""
-        return self._descend(state, *self._draw(state, recordings))
+        """One gradient step on recordings of which it draws its batch."""
+        choice = self._choice(state, recordings.shape)
+        batch = recordings[choice.rows, choice.numbers]
+        return self._step_on(state, batch, recordings.shape[0])
 
     def _run_on_source(
         self, state: RepresentationState, source: RecordingSource, num_steps: int
@@ -254,21 +256,11 @@ class RepresentationLearner:
         return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
 
     def _step_on(
-        self, state: RepresentationState, batch: jax.Array, num_actions: jax.Array
+        self, state: RepresentationState, batch: jax.Array, num_actions: int | jax.Array
     ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step on a batch [B, S, T, D0] of `num_actions` train actions."""
-        epoch = self._batches.epoch(state.step, num_actions)
-        return self._descend(state, self._features(batch), epoch, self._step_keys(state)[1])
-
-    def _descend(
-        self,
-        state: RepresentationState,
-        features: jax.Array,
-        epoch: jax.Array,
-        key_noise: jax.Array,
-    ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step; its arguments are those that `_draw` returns."""
-        weight = reconstruction_weight(epoch)
+        """One gradient step, and its metrics, on a batch [B, S, T, D0] of `num_actions` actions."""
+        features, (_, key_noise) = self._features(batch), self._step_keys(state)
+        weight = reconstruction_weight(self._batches.epoch(state.step, num_actions))
         gradient_of = jax.value_and_grad(self._loss, has_aux=True)
         (loss, (terms, batch_stats)), grads = gradient_of(
             state.params, state.batch_stats, features, key_noise, weight
@@ -291,15 +283,6 @@ class RepresentationLearner:
             step=state.step + 1,
         )
         return state, metrics
-
-    def _draw(
-        self, state: RepresentationState, recordings: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """This step's (features f32[B, S, T, D], epoch int32[], key of the latents' noise)."""
-        choice = self._choice(state, recordings.shape)
-        batch = recordings[choice.rows, choice.numbers]
-        epoch = self._batches.epoch(state.step, recordings.shape[0])
-        return self._features(batch), epoch, self._step_keys(state)[1]
 
     def _step_keys(self, state: RepresentationState) -> tuple[jax.Array, jax.Array]:
         """Keys of this step: of its batch, and of the latents' noise."""

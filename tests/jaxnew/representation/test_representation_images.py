@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage1_reference as reference
-from test_representation_networks import random_variables
+from test_hvae import random_variables
 
 from jaxnew.representation import images, objective
 from jaxnew.representation.config import RepresentationConfig
@@ -274,11 +274,13 @@ def test_the_flat_vae_of_images_draws_the_batches_of_the_hvae():
     class State:
         key_epochs, key_steps, step = key, jax.random.key(1), jnp.int32(5)
 
-    features, epoch, _ = learner._draw(State, recordings)
-    expected, same_epoch, _ = pooled._draw(State, recordings)
+    features, expected = (
+        each._features(recordings[each._choice(State, recordings.shape)])
+        for each in (learner, pooled)
+    )
     assert features.shape == (2, 3, 1, 84 * 84 * 3)
-    assert int(epoch) == int(same_epoch) == 2
     np.testing.assert_array_equal(features, expected)
+    assert [int(each._batches.epoch(State.step, 4)) for each in (learner, pooled)] == [2, 2]
 
 
 @pytest.mark.unit

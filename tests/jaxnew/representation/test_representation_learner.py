@@ -156,12 +156,12 @@ def test_every_step_draws_a_batch_and_noise_of_its_own(tiny, flat):
     ]
     assert len({float(of_step["reconstruction"]) for of_step in metrics}) == 3
     stage1 = learner.RepresentationLearner(dataclasses.replace(TINY, actions_per_batch=1), XY)
-    features, _, noise = zip(
-        *(stage1._draw(tiny[2].replace(step=jnp.int32(step)), tiny[1][:1]) for step in (0, 1, 2)),
-        strict=True,
-    )
-    assert len({np.asarray(x).tobytes() for x in features}) == 3
-    assert len({jax.random.key_data(key).tobytes() for key in noise}) == 3
+    states = [tiny[2].replace(step=jnp.int32(step)) for step in (0, 1, 2)]
+    recordings = tiny[1][:1]
+    drawn = [recordings[stage1._choice(state, recordings.shape)] for state in states]
+    assert len({np.asarray(x).tobytes() for x in drawn}) == 3
+    noise = [jax.random.key_data(stage1._step_keys(state)[1]) for state in states]
+    assert len({key.tobytes() for key in noise}) == 3
 
 
 @pytest.mark.unit
