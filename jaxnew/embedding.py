@@ -19,7 +19,8 @@ from jaxnew import collection, loop
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.observations import RecordingFormat, Recordings
 from jaxnew.representation import report
-from jaxnew.representation.learner import Modality, RepresentationLearner, RepresentationState
+from jaxnew.representation.learner import RepresentationLearner, RepresentationState
+from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
