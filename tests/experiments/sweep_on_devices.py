@@ -69,7 +69,9 @@ def main() -> None:
                 metrics[f"{index:03d}/{name}"], float(single_metrics[name]), rtol=1e-5
             )
     leaf = jax.tree.leaves(state.members.params)[0]
-    seven = SweepProgram.of(trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6])
+    seven = SweepProgram.of(
+        trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6]
+    )
     print(
         json.dumps(
             {

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.task.places import UsageError
-from jaxnew.storage import metrics
 from tests.experiments.commands import OPTIMIZED, read_json, run
 from tests.experiments.several import run_several
 
