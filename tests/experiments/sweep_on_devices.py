@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -35,17 +36,18 @@ def opinionated(state: TrainState) -> TrainState:
 def main() -> None:
     domain = Domain.of(load_task("grid_world"))
     table = engineered_table(domain.universe, "gt12")
-    base = train_config(domain, "ours", "gt12", table, domain.task.budget("smoke"), 31)
-    configs = member_configs(base, list(range(8)), {"entropy_coefficient": [0.0, 0.1]})
+    budget = domain.task.stage_two["smoke"]
+    base = train_config(domain, "ours", "gt12", table, budget, 31)
+    configs = member_configs(base, list(range(8)), {"entropy_coefficient": (0.0, 0.1)})
     trainer = Trainer.of(configs[0], domain.task, domain.split, table)
-    learner, actions = trainer.learner, trainer.training
     # As `Trainer` does it; one compilation serves all, for seeds and hyper-parameters are traced.
+    init = jax.jit(trainer.learner.init)
+    update = jax.jit(partial(trainer.learner.updates, num_updates=1))
     singles = [
-        learner.compiled_updates(
-            opinionated(learner.compiled_init(jax.random.key(config.seed), actions)),
+        update(
+            opinionated(init(jax.random.key(config.seed), trainer.training)),
             config.hyperparameters,
-            actions,
-            num_updates=1,
+            trainer.training,
         )
         for config in configs
     ]
@@ -67,8 +69,9 @@ def main() -> None:
                 metrics[f"{index:03d}/{name}"], float(single_metrics[name]), rtol=1e-5
             )
     leaf = jax.tree.leaves(state.members.params)[0]
-    sevens = [replace(base, seed=seed) for seed in range(7)]
-    seven = SweepProgram.of(trainer, sevens, jax.devices()[:6])
+    seven = SweepProgram.of(
+        trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6]
+    )
     print(
         json.dumps(
             {
