@@ -25,7 +25,7 @@ ARGUMENTS = m.Benchmark(__doc__)
 SET_SIZES = (20, 50, 250)
 MICROBATCHES = (0, 64, 128, 256, 512)
 # One gradient step a rollout: 32 environments make as many transitions as the minibatch has.
-_ONE_STEP = {"ppo__num_epochs": 1, "ppo__num_minibatches": 1}
+_ONE_STEP: dict[str, Any] = {"ppo__num_epochs": 1, "ppo__num_minibatches": 1}
 
 
 class GatherThenProject(UtilityMethod):
@@ -112,7 +112,7 @@ def report_layer(report: m.Report) -> None:
 
 
 def report_steps(
-    report: m.Report, variants: dict[str, tuple[UtilityMethod, int]], base: str, **changes: int
+    report: m.Report, variants: dict[str, tuple[UtilityMethod, int]], base: str, **changes: Any
 ) -> None:
     """A gradient step with each name -> (method, microbatch size), against that of `base`."""
     trainer = _trainers.make_trainer(report.is_quick, **_ONE_STEP, **changes)
@@ -140,8 +140,8 @@ def main() -> None:
     report = m.Report("utility", ARGUMENTS)
     report_layer(report)
     sizes, default = ((0, 8), 8) if report.is_quick else (MICROBATCHES, 256)
-    of_size = {f"microbatches of {size}": (UtilityMethod(), size) for size in sizes}
-    report_steps(report, of_size, f"microbatches of {default}", ppo__rollout__num_steps=128)
+    by_size = {f"microbatches of {size}": (UtilityMethod(), size) for size in sizes}
+    report_steps(report, by_size, f"microbatches of {default}", ppo__rollout__num_steps=128)
     for set_size in (5,) if report.is_quick else SET_SIZES:  # Fewer steps keep m = 250 short.
         forms = {
             f"{k}, m = {set_size}": (method(), 8 if report.is_quick else 128)

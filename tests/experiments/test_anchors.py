@@ -1,27 +1,20 @@
-"""The command `anchors`, its files, and where figures find them."""
+"""The command `anchors` and its files."""
 
 from __future__ import annotations
 
-import json
-import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from envs_mjx.shape_stacking import StackingSettings
 from experiments.anchors import measure_anchors
-from experiments.reports.anchors import Anchors, anchors_of, lines_of, markdown, notes_of
-from experiments.reports.runs import Group, read_runs
+from experiments.reports.anchors import Anchors, markdown
 from experiments.untrained import stacking
 from jaxnew.evaluation import EVALUATION_SEED
-from jaxnew.storage import config as config_lib
 from jaxnew.storage.config import ConfigError
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError
 from tests.experiments.commands import run
-from tests.experiments.handwritten import plain_config, write_run
 
 
 @pytest.mark.integration
@@ -109,66 +102,3 @@ def test_sizes_and_settings_have_files_of_their_own(
         measure_anchors(domain, ["test"], [], 4, tmp_path, ["environment.physics=bullet"])
     with pytest.raises(ConfigError, match="friction"):
         measure_anchors(domain, ["test"], [], 4, tmp_path, ["environment.friction=1"])
-
-
-def group_at(
-    folder: Path, split: str = "default", set_size: int = 20, max_actions: int = 10
-) -> Group:
-    task = load_task("shape_stacking")
-    config = {
-        **plain_config(split=split),
-        "task": task.name,
-        "ppo": config_lib.to_dict(task.budget("paper").ppo),
-        "sets": {**config_lib.to_dict(task.budget("paper").sets), "size": set_size},
-        "environment": config_lib.to_dict(StackingSettings(max_actions=max_actions)),
-    }
-    name = f"run-{split}-{set_size}-{max_actions}"
-    path = write_run(folder / name, config, metric="final_height")
-    return Group("ours", task, tuple(read_runs([path])))
-
-
-def write_anchors(folder: Path, height: float, **changes: Any) -> Anchors:
-    interval = {"mean": height, "low": height - 0.1, "high": height + 0.1}
-    values = {"stop at once": {part: {"final_height": interval} for part in ("train", "test")}}
-    fields = {"task": "shape_stacking", "split": "default", "engine": "mujoco_c", **changes}
-    anchors = Anchors(**fields, set_size=20, num_episodes=4, seed=1, values=values)
-    anchors.save(folder)
-    return anchors
-
-
-@pytest.mark.unit
-def test_anchors_stand_beside_their_runs(tmp_path: Path) -> None:
-    runs = tmp_path / "shape_stacking"
-    group = group_at(runs)
-    assert anchors_of(group) == []
-    assert notes_of([group]) == []
-    first = write_anchors(runs / "anchors", 0.25)
-    full = write_anchors(runs / "anchors", 0.5, split="full")
-    assert anchors_of(group) == [first]
-    assert lines_of(group) == {"stop at once": 0.25}
-    assert lines_of(group, "validation") == {}
-    assert lines_of(group_at(runs, "full")) == {"stop at once": 0.5}
-    assert lines_of(group_at(runs, set_size=10)) == {}
-    # In a sweep, a member is further down.
-    assert anchors_of(group_at(runs / "sweep" / "members")) == [first]
-    assert anchors_of(group_at(tmp_path / "elsewhere")) == []
-    both = notes_of([group, group_at(runs, "full"), group_at(runs / "sweep")])
-    assert both == [markdown(first), markdown(full)]
-    # Of worlds with other settings there are others.
-    short = group_at(runs, max_actions=3)
-    assert lines_of(short) == {}
-    write_anchors(runs / "anchors", 0.375, environment={"max_actions": 3})
-    assert lines_of(short) == {"stop at once": 0.375}
-    write_anchors(runs / "anchors", 0.75, engine="mjx")
-    assert lines_of(group) == {"stop at once (mjx)": 0.75, "stop at once (mujoco_c)": 0.25}
-    # A file of the version before, which was named otherwise, counts unless there is a newer one.
-    newer = runs / "anchors" / "default-mujoco_c-m20.json"
-    older = newer.rename(newer.with_name("default-mujoco_c.json"))
-    assert lines_of(group)["stop at once (mujoco_c)"] == 0.25
-    write_anchors(runs / "anchors", 0.125)
-    os.utime(older, (0, 0))
-    assert lines_of(group)["stop at once (mujoco_c)"] == 0.125
-    file = runs / "anchors" / "default-mjx-m20.json"
-    file.write_text(json.dumps({"task": "shape_stacking"}))
-    with pytest.raises(UsageError, match=r"default-mjx-m20\.json is damaged"):
-        lines_of(group)
