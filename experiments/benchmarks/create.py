@@ -10,7 +10,7 @@ with a new layout and a new set of tools. The share of the physics is the time i
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -23,13 +23,13 @@ from envs_host.create.config import Observation
 from envs_host.create.drawing import draw
 from envs_host.create.stage import Stage
 from envs_host.create.tools import all_tools
+from envs_host.create.world import World
 from experiments.benchmarks import _measure as m
 
 ARGUMENTS = m.Benchmark(__doc__)
 ARGUMENTS.define("list", "levels", ["Push", "Obstacle"], "What is played.")
 
 SUBSTEPS = CreateConfig().physics.substeps
-_DRAWN: tuple[Observation, ...] = ("gray", "rgb")
 _NUM_TOOLS = 10
 _MAX_TRIES = 10_000
 
@@ -92,8 +92,8 @@ def crowded_env(level: str, num_tools: int) -> CreateEnv:
 
 
 def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
-    """Random play of one level with gray, RGB and no observations, and the share of the physics."""
-    names: tuple[Observation, ...] = (*_DRAWN, "none")
+    """Random play of one level, drawn and not, and the share of the physics."""
+    names: tuple[Observation, ...] = ("gray", "none")
     envs = {name: CreateEnv(level, config=CreateConfig(observation=name)) for name in names}
     timings = report.measure({name: _subject(env, num_decisions) for name, env in envs.items()})
     for name, timing in timings.items():
@@ -102,12 +102,11 @@ def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
             timing,
             work={"decisions": num_decisions, "substeps": num_decisions * SUBSTEPS},
             num_envs=1,
-            includes=["auto-reset"] + ["rendering"] * (name in _DRAWN),
+            includes=["auto-reset"] + ["rendering"] * (name != "none"),
             how=f"random play, {num_decisions} decisions, one process",
         )
-    for name in _DRAWN:
-        share = m.share_saved(timings[name], timings["none"])
-        report.values(f"{level}, share of drawing {name}", share, how="1 - none / drawn")
+    share = m.share_saved(timings["gray"], timings["none"])
+    report.values(f"{level}, share of drawing", share, how="1 - none / gray")
     clock = Clock()
     with timed_physics(clock):
         random_play(envs["gray"], 0, num_decisions)
@@ -127,31 +126,22 @@ def _subject(env: CreateEnv, num_decisions: int) -> m.Subject:
 
 
 def measure_frames(report: m.Report, num_frames: int) -> None:
-    """A frame of Push alone, at the start and with ten tools."""
+    """A gray frame of Push alone, at the start and with ten tools."""
     for num_tools in (0, _NUM_TOOLS):
         world = crowded_env("Push", num_tools).world
-        timings = report.measure(
-            {
-                mode: m.Subject(_draw_often(world.sprites, mode, num_frames), lambda key: ())
-                for mode in _DRAWN
-            }
+
+        def draw_often(world: World = world) -> None:
+            for _ in range(num_frames):
+                draw(world.sprites(), "gray")
+
+        name = f"one gray frame, Push with {num_tools} tools"
+        report.timing(
+            name,
+            report.measure({name: m.Subject(draw_often, lambda key: ())})[name],
+            work={"frames": num_frames},
+            includes=["rendering"],
+            how=f"{num_frames} times the same world",
         )
-        for mode, timing in timings.items():
-            report.timing(
-                f"one {mode} frame, Push with {num_tools} tools",
-                timing,
-                work={"frames": num_frames},
-                includes=["rendering"],
-                how=f"{num_frames} times the same world",
-            )
-
-
-def _draw_often(sprites: Callable, mode: str, num_frames: int) -> Callable[[], None]:
-    def call() -> None:
-        for _ in range(num_frames):
-            draw(sprites(), mode)
-
-    return call
 
 
 def main() -> None:

@@ -53,20 +53,17 @@ class Game:
     has_auto_reset: bool = True
 
 
-def grid_world(has_auto_reset: bool = True, reads_final_observation: bool = False) -> Game:
+def grid_world(has_auto_reset: bool = True) -> Game:
     """Ours; `step_env` without auto-reset, which plays on after an end and draws nothing."""
     env = GridWorld()
     params = env.default_params
     step_one = env.step if has_auto_reset else env.step_env
 
     def reset(key: jax.Array) -> Any:
-        obs, state = env.reset(key, params)
-        return (obs, state, obs) if reads_final_observation else (obs, state)
+        return env.reset(key, params)
 
     def step(key: jax.Array, carry: Any, action: jax.Array) -> tuple[Any, jax.Array]:
-        obs, state, reward, _, _, info = step_one(key, carry[1], Action.of(action), params)
-        if reads_final_observation:
-            return (obs, state, info["final_observation"]), reward
+        obs, state, reward, *_ = step_one(key, carry[1], Action.of(action), params)
         return (obs, state), reward
 
     return Game(
@@ -185,14 +182,10 @@ def subject(game: Game, num_envs: int, num_steps: int) -> m.Subject:
 
 
 def games_of(report: m.Report, names: list[str]) -> dict[str, Game]:
-    """Ours in three forms, and the peers that can be imported; a line for each that cannot."""
+    """Ours in two forms, and the peers that can be imported; a line for each that cannot."""
     games = {}
     if "grid_world" in names:
-        games = {
-            "raw": grid_world(has_auto_reset=False),
-            "auto-reset": grid_world(),
-            "auto-reset, final observation": grid_world(reads_final_observation=True),
-        }
+        games = {"raw": grid_world(has_auto_reset=False), "auto-reset": grid_world()}
     for name in [name for name in PEERS if name in names]:
         try:
             games[name] = PEERS[name]()

@@ -122,12 +122,12 @@ def compare(
         # The others are idle but for the calls, of which one was not counted.
         children_s = (m.cpu_s_of(way.pids) - before[case]) / (report.repeats + 1)
         cpu_us[case] = 1e6 * (timings[case].median.cpu_s + children_s) / num_decisions
-    report_overheads(report, name, timings, cpu_us, num_envs, num_decisions)
+    if name == EMPTY:  # Elsewhere the differences are those of the work.
+        report_overheads(report, timings, cpu_us, num_envs, num_decisions)
 
 
 def report_overheads(
     report: m.Report,
-    name: str,
     timings: dict[str, m.Timing],
     cpu_us: dict[str, float],
     num_envs: int,
@@ -147,13 +147,11 @@ def report_overheads(
         "all processes; wall is below zero where processes share work"
     )
     for case, values in beyond.items():
-        report.values(f"{name}, overhead of {case}", values, how=how, num_envs=num_envs)
-    if name != EMPTY:  # There the differences are those of the work, not of the overhead.
-        return
+        report.values(f"{EMPTY}, overhead of {case}", values, how=how, num_envs=num_envs)
     how = "cpu is that of all processes, which other load disturbs less"
     for case in map(pool_name, NUM_WORKERS):
         values = {clock[:-3]: beyond[PEER][clock] / us for clock, us in beyond[case].items()}
-        report.values(f"{name}, overhead of {PEER} / {case}", values, how=how, num_envs=num_envs)
+        report.values(f"{EMPTY}, overhead of {PEER} / {case}", values, how=how, num_envs=num_envs)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Grid World at the paper's shapes: steps per second, where the time goes, how far from the floor.
 
     python -m experiments.benchmarks.training
-    python -m experiments.benchmarks.training --parts=update    # Half a minute.
+    python -m experiments.benchmarks.training --noparts    # The first alone, in half a minute.
 
 Where the time goes is measured by ablation: the compiled whole against the same program with one
 part replaced by a cheap stand-in, in alternation in one process. A part's share is what goes away
@@ -30,10 +30,8 @@ from jaxnew.rollout.device import DeviceRollout
 from jaxnew.sampling import Actions, AvailableSet
 from jaxnew.trainer import Trainer
 
-PARTS = ("update", "rollout", "learning", "sets", "floor", "evaluation")
-
 ARGUMENTS = m.Benchmark(__doc__)
-ARGUMENTS.define("list", "parts", list(PARTS), f"What is timed: {', '.join(PARTS)}.")
+ARGUMENTS.define("bool", "parts", True, "Whether parts, floor and evaluation are measured, too.")
 
 
 @struct.dataclass
@@ -117,11 +115,6 @@ class InOrder(Learner):
 Subjects = dict[str, m.Subject]
 
 
-def without(part: str) -> str:
-    """What a subject is called in which a part has a stand-in."""
-    return f"without {part}"
-
-
 def rollout_subjects(trainer: Trainer, state: TrainState) -> Subjects:
     """The rollout, and versions of it in each of which one part is replaced."""
     whole = trainer.rollout
@@ -129,15 +122,15 @@ def rollout_subjects(trainer: Trainer, state: TrainState) -> Subjects:
     unscaled = replace(whole.config, normalize_observations=False, normalize_rewards=False)
     counted = CountedSets(**vars(trainer.training))
     variants = {
-        "normalisation": replace(whole, config=unscaled),
-        "inference": replace(whole, method=WithoutInference()),
-        "sampling": replace(whole, method=WithoutSampling()),
-        "environment": replace(whole, env=StillWorld()),
+        "without normalisation": replace(whole, config=unscaled),
+        "without inference": replace(whole, method=WithoutInference()),
+        "without sampling": replace(whole, method=WithoutSampling()),
+        "without environment": replace(whole, env=StillWorld()),
     }
     return {
         "rollout": _trainers.collecting(trainer, state),
-        without("set drawing"): _trainers.collecting(trainer, state, actions=counted),
-        **{without(k): _trainers.collecting(trainer, state, v) for k, v in variants.items()},
+        "without set drawing": _trainers.collecting(trainer, state, actions=counted),
+        **{name: _trainers.collecting(trainer, state, it) for name, it in variants.items()},
     }
 
 
@@ -161,8 +154,8 @@ def learning_subjects(trainer: Trainer, state: TrainState) -> Subjects:
 
     return {
         "learning": whole,
-        without("gradients"): _trainers.learning(trainer, state, WithoutGradient(*parts)),
-        without("permutation"): _trainers.learning(trainer, state, InOrder(*parts)),
+        "without gradients": _trainers.learning(trainer, state, WithoutGradient(*parts)),
+        "without permutation": _trainers.learning(trainer, state, InOrder(*parts)),
         "advantages": m.compiled(advantages, lambda key: (whole.inputs(key)[3],)),
     }
 
@@ -274,17 +267,13 @@ def main() -> None:
     # Two updates, after which episodes no longer start together.
     state, _ = trainer.chunk(trainer.init(), 2)
     subjects = {"update": _trainers.updating(trainer, state)}
-    if "rollout" in ARGUMENTS.parts:
-        subjects |= rollout_subjects(trainer, state)
-    if "learning" in ARGUMENTS.parts:
-        subjects |= learning_subjects(trainer, state)
-    if "sets" in ARGUMENTS.parts:
+    if ARGUMENTS.parts:
+        subjects |= rollout_subjects(trainer, state) | learning_subjects(trainer, state)
         subjects |= set_subjects(trainer)
     timings = report.measure(subjects)
     report_parts(report, trainer, timings)
-    if "floor" in ARGUMENTS.parts:
+    if ARGUMENTS.parts:
         report_floor(report, trainer, timings["update"])
-    if "evaluation" in ARGUMENTS.parts:
         report_evaluation(report, trainer, state)
 
 

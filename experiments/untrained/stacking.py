@@ -112,49 +112,42 @@ class Move:
 
 
 @struct.dataclass
-class RandomMoves:
-    """Uniform choices and positions, and a stop with a probability.
-
-    Attributes:
-      choice: of the available actions.
-      stop_probability, position_dim: see `StackingAnchor`.
-    """
-
-    choice: Categorical
-    stop_probability: float = struct.field(pytree_node=False)
-    position_dim: int = struct.field(pytree_node=False)
-
-    def sample(self, key: jax.Array) -> Move:
-        """One draw; consumes `key`."""
-        key_choice, key_position, key_stop = jax.random.split(key, 3)
-        return Move(
-            self.choice.sample(key_choice),
-            jax.random.uniform(key_position, (self.position_dim,), minval=-1.0, maxval=1.0),
-            jax.random.bernoulli(key_stop, self.stop_probability),
-        )
-
-
-@struct.dataclass
-class ScriptedMoves:
-    """The flat-topped shapes by decreasing s, all on the left cylinder; then nothing more.
+class Moves:
+    """What a policy may do.
 
     Attributes:
       obs: f32[..., 2] of `OpenStacking`.
       sizes: f32[..., m] s of flat-topped shapes, 0 for all others.
-      position_dim: see `StackingAnchor`.
+      mask: bool[..., m] true for a real entry of the set.
+      name, position_dim: see `StackingAnchor`.
     """
 
     obs: jax.Array
     sizes: jax.Array
+    mask: jax.Array
+    name: str = struct.field(pytree_node=False)
     position_dim: int = struct.field(pytree_node=False)
 
     def sample(self, key: jax.Array) -> Move:
-        """Nothing is drawn."""
-        del key
+        """What it does; consumes `key`."""
+        return self._scripted() if self.name == SCRIPTED else self._random(key)
+
+    def _random(self, key: jax.Array) -> Move:
+        """A uniform choice and position, and perhaps a stop."""
+        key_choice, key_position, key_stop = jax.random.split(key, 3)
+        return Move(
+            Categorical.masked(jnp.zeros_like(self.sizes), self.mask).sample(key_choice),
+            jax.random.uniform(key_position, (self.position_dim,), minval=-1.0, maxval=1.0),
+            jax.random.bernoulli(key_stop, RANDOM[self.name]),
+        )
+
+    def _scripted(self) -> Move:
+        """The flat-topped shapes by decreasing s, all on the left cylinder; then nothing more."""
         left_x, number = self.obs[0], self.obs[1].astype(jnp.int32)
-        order = jnp.argsort(-self.sizes)
+        sizes = jnp.where(self.mask, self.sizes, 0.0)
+        order = jnp.argsort(-sizes)
         choice = order[jnp.minimum(number, len(order) - 1)]
-        is_there = (number < len(order)) & (self.sizes[choice] > 0.0)
+        is_there = (number < len(order)) & (sizes[choice] > 0.0)
         return Move(
             jnp.where(is_there, choice, -1),
             jnp.stack([left_x, jnp.float32(0.0)])[: self.position_dim],
@@ -180,14 +173,10 @@ class StackingAnchor:
 
     def distribution(
         self, params: Any, obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> RandomMoves | ScriptedMoves:
-        """What it does, given rows f32[..., m, 1] of `flat_sizes`."""
+    ) -> Moves:
+        """What it may do, given rows f32[..., m, 1] of `flat_sizes`."""
         del params
-        sizes = jnp.where(mask, projected[..., 0], 0.0)
-        if self.name == SCRIPTED:
-            return ScriptedMoves(obs, sizes, self._position_dim)
-        uniform = Categorical.masked(jnp.zeros_like(sizes), mask)
-        return RandomMoves(uniform, RANDOM[self.name], self._position_dim)
+        return Moves(obs, projected[..., 0], mask, self.name, self._position_dim)
 
     def decode(self, sample: Move, available: AvailableSet, table: jax.Array) -> Action:
         """The action; an id of -1 places nothing."""

@@ -32,8 +32,7 @@ def test_overheads_of_made_up_timings(tmp_path: Path) -> None:
     cpu_us = {"plain loop": 1.0, "pool, 1 worker": 3.0, "pool, 2 workers": 5.0, pool.PEER: 21.0}
     timings = {case: timing((x, x, 9.0), (0.0, 0.0, 0.0)) for case, x in wall_s.items()}
     report = report_to(output)
-    for name in (pool.EMPTY, pool.WORKING):
-        pool.report_overheads(report, name, timings, cpu_us, num_envs=4, num_decisions=10)
+    pool.report_overheads(report, timings, cpu_us, num_envs=4, num_decisions=10)
     lines = read(output)
     values = {line["case"]: line["values"] for line in lines}
     peer = values[f"empty, overhead of {pool.PEER}"]
@@ -41,7 +40,7 @@ def test_overheads_of_made_up_timings(tmp_path: Path) -> None:
     ratios = {n: values[f"empty, overhead of {pool.PEER} / {pool.pool_name(n)}"] for n in (1, 2)}
     assert ratios[1] == {"wall": pytest.approx(4.5), "cpu": pytest.approx(10.0)}
     assert ratios[2] == {"wall": pytest.approx(9.0), "cpu": pytest.approx(5.0)}
-    assert len(lines) == 5 + 3  # Ratios only where there is no work.
+    assert len(lines) == 5
 
 
 @pytest.mark.unit
@@ -87,7 +86,7 @@ def test_environment_runs_without_peers(tmp_path: Path) -> None:
 @pytest.mark.integration
 def test_create_tells_what_drawing_and_physics_take(tmp_path: Path) -> None:
     lines = {line["case"]: line for line in run_quick("create", tmp_path)}
-    for name in ("gray", "rgb", "none"):
+    for name in ("gray", "none"):
         rates = lines[f"Push, observation {name}"]["rates"]
         assert rates["substeps"]["median"] == pytest.approx(40 * rates["decisions"]["median"])
         assert ("rendering" in lines[f"Push, observation {name}"]["includes"]) == (name != "none")
