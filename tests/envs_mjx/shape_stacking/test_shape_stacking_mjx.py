@@ -25,7 +25,7 @@ from envs_mjx.shape_stacking.engines import (
 )
 from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments import stacking_figures as figures
+from experiments.untrained import stacking as anchors
 from experiments.untrained import towers as stacking
 
 pytestmark = pytest.mark.optimized
@@ -147,8 +147,11 @@ def test_17_random_play_in_all_slots(all_slots: OneProgram, c_engine: MujocoC) -
     Distributions whose cumulative shares differ by 0.47 would be told apart; for a mean that is
     off, see the standard error of the paired differences.
     """
-    never_stop = figures.random_play(0.0)
-    ours, theirs = (figures.play(one, never_stop, WIDTH, 0)[0] for one in (all_slots, c_engine))
+    envs = [anchors.OpenStacking(one) for one in (all_slots.engine, c_engine)]
+    ours, theirs = (
+        anchors.play(env, "random, never stops", np.arange(810), 20, WIDTH)["final_height"]
+        for env in envs
+    )
     difference = ours - theirs
     error = difference.std(ddof=1) / np.sqrt(WIDTH)
     print(f"MJX {ours.mean():.3f}, C {theirs.mean():.3f}, {difference.mean():+.3f} +- {error:.3f}")
