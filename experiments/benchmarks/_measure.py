@@ -124,11 +124,11 @@ def compiled(
     return Subject(program, inputs, cost)
 
 
-def measure(subjects: Mapping[str, Subject], repeats: int, seed: int = 0) -> dict[str, Timing]:
+def measure(subjects: Mapping[str, Subject], repeats: int) -> dict[str, Timing]:
     """Times every subject `repeats` times, in alternation, after one call that is not counted."""
     costs: dict[str, list[Cost]] = {name: [] for name in subjects}
     for round_ in range(repeats + 1):
-        key = jax.random.fold_in(jax.random.key(seed), round_)
+        key = jax.random.fold_in(jax.random.key(0), round_)
         for name, subject in subjects.items():
             arguments = jax.block_until_ready(subject.inputs(key))
             costs[name].append(timed(partial(subject.call, *arguments))[1])
@@ -259,17 +259,9 @@ class Report:
         self._write(case=case, num_envs=num_envs, how=how, values=dict(values))
         self._print(case, [f"{name} {value:,.4g}" for name, value in values.items()])
 
-    def ratio(
-        self,
-        case: str,
-        one: Timing,
-        other: Timing,
-        *,
-        how: str = RATIO,
-        num_envs: int | None = None,
-    ) -> None:
+    def ratio(self, case: str, one: Timing, other: Timing, *, how: str = RATIO) -> None:
         """How many times longer one subject takes than the other."""
-        self.values(case, ratio(one, other), how=how, num_envs=num_envs)
+        self.values(case, ratio(one, other), how=how)
 
     def _print(self, case: str, shown: Sequence[str]) -> None:
         print(f"  {case:<58} {'   '.join(shown)}", flush=True)

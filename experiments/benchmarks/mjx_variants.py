@@ -115,9 +115,7 @@ class Variant:
 def _variants() -> list[Variant]:
     spec = {"solver": Solver(8, 12)}
     return [
-        Variant(
-            "MJX's routine for two hulls, solver 8/12 (the spec's design)", spec, _hulls_by_mjx
-        ),
+        Variant("MJX's routine for two hulls, solver 8/12 (the first design)", spec, _hulls_by_mjx),
         Variant("our routine for two hulls, solver 8/12", spec),
         Variant("our routine, solver 5/5", {"solver": Solver(5, 5)}),
         Variant("default: our routine, solver 3/5"),

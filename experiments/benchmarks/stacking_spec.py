@@ -112,7 +112,7 @@ def main() -> None:
     print("# Shape Stacking: what the engines do\n")
     command = f"python -m experiments.benchmarks.stacking_spec {' '.join(sys.argv[1:])}"
     print(f"    {command.rstrip()}\n\n{', '.join(names)}. Values beyond the tolerance are bold.\n")
-    print("## Figures of the spec (m)\n")
+    print("## Reference figures (m)\n")
     columns = columns_of(engines)
     print(figures_table(columns))
     if has_mjx:
