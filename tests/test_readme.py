@@ -1,6 +1,6 @@
 """What the README and `docs/environments.md` show runs as it stands there.
 
-Commands are run by `tests/experiments`, the pages of one's own domain and policy by `tests/examples`.
+Commands run in `tests/experiments`, pages of one's own domain and policy in `tests/examples`.
 """
 
 from __future__ import annotations
