@@ -34,9 +34,10 @@ def test_one_process_imports_every_command() -> None:
     """So none defines a flag that another has, or one for all."""
     for name in COMMANDS:
         assert callable(command(name).main)
-        assert "debug_nans" in command(name).ARGUMENTS._names
-    modules = flags.FLAGS.flags_by_module_dict()
-    assert all(name.startswith(("absl", "pytest")) for name, found in modules.items() if found)
+        assert "debug_nans" in command(name).ARGUMENTS._values
+    of_all = flags.FLAGS.flags_by_module_dict()
+    ours = ("experiments", "jaxnew", "envs_host", "envs_mjx", "__main__")
+    assert [module for module in of_all if module.startswith(ours)] == []
 
 
 @pytest.mark.parametrize("name", COMMANDS)
@@ -80,6 +81,17 @@ def test_what_is_not_there_is_refused(
     with pytest.raises(SystemExit) as end:
         run(monkeypatch, *words)
     assert str(end.value).startswith(message)
+
+
+def test_help_says_what_may_be_given() -> None:
+    evaluate, sweep = (command(name).ARGUMENTS.help_text() for name in ("evaluate", "sweep"))
+    assert "  --checkpoint\n      best, latest. Which checkpoint;" in evaluate
+    assert "  --episodes\n      Episodes per set. Default: 5000.\n" in evaluate
+    assert (
+        "  --sets\n      Parts of the split: train, validation, test, all. Default: test."
+        in evaluate
+    )
+    assert "  --vary\n      hyperparameter=value,value,... Repeatable.\n" in sweep
 
 
 def test_a_second_command_line_starts_from_the_defaults() -> None:
