@@ -39,7 +39,7 @@ def hvae_run(runs: Path) -> Path:
     commands = re.findall(r"^jaxnew (.+ --budget=laptop)$", readme, re.MULTILINE)
     assert [command.split()[0] for command in commands] == ["collect", "embed", "train"]
     for command in commands:
-        smaller = command.replace("laptop", "smoke").replace("evaluate_every=50", "evaluate_every=2")
+        smaller = command.replace("laptop", "smoke").replace("every=50", "every=2")
         run(*smaller.split(), f"--runs={runs}")
     return runs / "grid_world" / "ours-hvae-relative-default-smoke-31"
 
