@@ -215,12 +215,17 @@ class Runs:
       path: directory of the sweep.
       rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
         hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
-      selection_metric: what `best_metric` is.
+      task: what they were trained on.
     """
 
     path: Path
     rows: tuple[Mapping[str, Any], ...]
-    selection_metric: str
+    task: Task
+
+    @property
+    def selection_metric(self) -> str:
+        """What `best_metric` is."""
+        return f"validation/{self.task.selection_metric}"
 
     def table(self) -> list[dict[str, Any]]:
         """Rows for `pandas.DataFrame`."""
@@ -231,7 +236,7 @@ class Runs:
 
     def __iter__(self) -> Iterator[Run]:
         """Loads one run after the other."""
-        return (Run.load(row["path"]) for row in self.rows)
+        return (Run.load(row["path"], task=self.task) for row in self.rows)
 
     def best(self) -> Run:
         """The run with the highest validation.
@@ -242,7 +247,8 @@ class Runs:
         rated = [row for row in self.rows if row["best_metric"] is not None]
         if not rated:
             raise UsageError(f"{self.path} has no evaluated runs; sweep again to go on.")
-        return Run.load(max(rated, key=lambda row: row["best_metric"])["path"])
+        best = max(rated, key=lambda row: row["best_metric"])
+        return Run.load(best["path"], task=self.task)
 
 
 def sweep(
@@ -311,7 +317,7 @@ def sweep(
             may_be_nan=("*",),  # One diverged member does not end the others.
         )
         rows = () if result.was_interrupted else write_members(directory, program, result.state)
-    return Runs(path, rows, trainer.selection_metric)
+    return Runs(path, rows, task)
 
 
 def checked_seeds(seeds: Iterable[int]) -> list[int]:

@@ -68,7 +68,7 @@ def figures_table(columns: Columns) -> str:
         spec = first.spec if isinstance(first.spec, str) else f"{first.spec:.3f}"
         tolerance = "" if first.tolerance is None else f"{first.tolerance:g}"
         rows.append([str(first.check), first.what, spec, tolerance, *map(_shown, found)])
-    return m.markdown(["check", "what", "spec", "tolerance", *columns], rows)
+    return m.markdown(["check", "what", "reference", "tolerance", *columns], rows)
 
 
 def differences_table(columns: Columns, one: str, other: str) -> str:
@@ -100,7 +100,7 @@ def anchors_table(engines: dict[str, Engine], episodes: int) -> str:
             cells += [f"{heights.mean():.3f} +- {error:.3f}", f"{found['reward'].mean():.3f}"]
         rows.append(cells)
     measured = [f"{what}, {name}" for name in engines for what in ("height", "reward")]
-    return m.markdown(["policy", "height, spec", "reward, spec", *measured], rows)
+    return m.markdown(["policy", "height, reference", "reward, reference", *measured], rows)
 
 
 def main() -> None:

@@ -22,25 +22,16 @@ from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from jaxnew import trainer
 from jaxnew.ppo import Learner
-<<<<<<< HEAD
-=======
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.trainer import rollout_of
->>>>>>> main
 
 EPISODES = 4
 
 _settle = MujocoC.settle_host
 _placed: set[int] = set()
 _batches: set[tuple[int, ...]] = set()
-<<<<<<< HEAD
-_rollout_of = trainer.rollout_of
-_rollouts: dict[Any, Any] = {}
-_learners: dict[Any, Learner] = {}
-=======
 _rollouts: dict[Any, Any] = {}
 _learners: dict[Any, Any] = {}
->>>>>>> main
 
 
 class Seen(NamedTuple):
@@ -63,11 +54,7 @@ def watched(job: list[str]) -> Iterator[None]:
     _batches.clear()
     with (
         mock.patch.object(MujocoC, "settle_host", _noting),
-<<<<<<< HEAD
-        mock.patch.object(trainer, "rollout_of", _shared_rollout),
-=======
         mock.patch.object(trainer, "rollout_of", _shared),
->>>>>>> main
         mock.patch.object(trainer, "Learner", _shared_learner),
     ):
         yield
@@ -97,25 +84,6 @@ def _noting(engine: MujocoC, shape_ids: Any, qpos: Any, qvel: Any) -> Any:
     return _settle(engine, shape_ids, qpos, qvel)
 
 
-<<<<<<< HEAD
-def _shared_rollout(task: Any, method: Any, config: Any, *others: Any) -> Any:
-    """`rollout_of`, which gives the same to jobs that differ in numbers only."""
-    task = replace(task, evaluation_width=EPISODES)
-    if method.name != "ours":
-        return _rollout_of(task, method, config, *others)
-    key = (task.name, task.environment, method._is_conditioned, config.rollout)
-    if key not in _rollouts:
-        _rollouts[key] = _rollout_of(task, method, config, *others)
-    return _rollouts[key]
-
-
-def _shared_learner(rollout: Any, config: Any) -> Learner:
-    """One learner for all that are alike; it keeps its rollout, whose id stays its own."""
-    key = (id(rollout), config)
-    if key not in _learners:
-        _learners[key] = Learner(rollout, config)
-    return _learners[key]
-=======
 def _shared(task: Any, method: Any, config: Any, *others: Any) -> DeviceRollout:
     """`rollout_of`, which gives the same to jobs that differ in numbers only."""
     task = replace(task, evaluation_width=EPISODES)
@@ -131,4 +99,3 @@ def _shared_learner(rollout: DeviceRollout, config: Any) -> Learner:
     """`Learner`, one for each rollout and config, with its compiled programs."""
     # The rollouts are kept, so that their ids stay theirs.
     return _learners.setdefault((id(rollout), config), Learner(rollout, config))
->>>>>>> main

@@ -26,7 +26,7 @@ def test_tables(monkeypatch: pytest.MonkeyPatch) -> None:
     engine = MujocoC(settle_steps=1)
     columns = stacking_spec.columns_of({"a": engine, "b": engine})
     assert stacking_spec.figures_table(columns).splitlines() == [
-        "| check | what | spec | tolerance | a | b |",
+        "| check | what | reference | tolerance | a | b |",
         "| --- | --- | --- | --- | --- | --- |",
         "| 6 | cube: z1 | 0.482 | 0.005 | 0.4840 | **0.4880** |",
         "| 16 | cone: z2 | falls |  | 0.3000 | 0.9000 |",
