@@ -37,7 +37,9 @@ class RunCurve:
     values: np.ndarray
 
     def held_at_best(self) -> RunCurve:
-        """The curve up to its first maximum, and that maximum from there on (spec method 11)."""
+        """The curve up to its first maximum, and that maximum from there on (docs/method.md,
+        "Figures").
+        """
         best = int(np.argmax(self.values)) if len(self.values) else 0
         is_after = np.arange(len(self.values)) > best
         return RunCurve(self.steps, np.where(is_after, self.values[best : best + 1], self.values))

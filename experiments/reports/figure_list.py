@@ -1,12 +1,12 @@
-"""The figures of the paper: which settings each of them shows, by task (experiments spec 2)."""
+"""The figures of the paper: which settings each of them shows, by task."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from experiments.pipeline import flags as flag
 from experiments.reports.production import Cell
+from jaxnew.task.places import UsageError
 
 _BASELINES = ("ours", "continuous", "nearest-neighbour")
 _ABLATIONS = ("ours", "no-entropy", "no-subsampling")
@@ -62,7 +62,6 @@ def _each(tasks: Sequence[str], cells: tuple[Cell, ...]) -> dict[str, tuple[Cell
 
 _OURS = Cell("ours", "hvae")
 _STACKING = "shape_stacking"
-# Experiments spec 3 and 14.
 _STACKING_NOTE = (
     "The paper's bars of Shape Stacking merge the results of several machines, which agree within "
     "a machine rather than within a seed, and some values were typed by hand "
@@ -73,7 +72,7 @@ _FIXED_SET_NOTE = (
     "which rebuilds the scene at each drop, and are not comparable with any other."
 )
 _TUNED = _cells(("ours", "nearest-neighbour"), "hvae")
-# The encoder of the analysis has seen its whole universe (spec method 10).
+# The encoder of the analysis has seen its whole universe (docs/create.md, "Analysis").
 _ANALYSED = _each(_CREATE, (Cell("ours", "hvae-oracle", variant="-analysis"),))
 
 FIGURES: dict[str, PaperFigure] = {
@@ -109,8 +108,8 @@ FIGURES: dict[str, PaperFigure] = {
         "tools of unseen classes",
         _each(_CREATE, (Cell("ours", "hvae", split="full"),)),
         note="The paper's numbers are those of its last runs. Older runs in its release reached "
-        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`; "
-        "experiments spec 5), so that the target is uncertain.",
+        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`), "
+        "so that the target is uncertain.",
     ),
     "7b": PaperFigure(
         "bars",
@@ -122,7 +121,7 @@ FIGURES: dict[str, PaperFigure] = {
         },
         notes={
             _STACKING: f"{_STACKING_NOTE} Its engineered vectors had their classes in an order "
-            "that changed from process to process (spec shape_stacking 8); ours do not."
+            "that changed from process to process; ours do not."
         },
     ),
     "8": PaperFigure(
@@ -172,7 +171,7 @@ FIGURES: dict[str, PaperFigure] = {
         "bars",
         "no reward for subgoals",
         _each(_CREATE, (_OURS, Cell("ours", "hvae", variant="-no-subgoals"))),
-        note="Ours is paid for the goal only (spec create 6.6); the release does not record which "
+        note='Ours is paid for the goal only (docs/create.md, "Rewards"); the release does not record which '
         "rewards the paper's runs lacked.",
     ),
     "21": PaperFigure(
@@ -224,10 +223,10 @@ def number_of(number: str, task: str) -> str:
       UsageError: there is none, or it does not show the task.
     """
     if number not in FIGURES:
-        raise flag.UsageError(f"No figure {number!r}; choose of {', '.join(FIGURES)}.")
+        raise UsageError(f"No figure {number!r}; choose of {', '.join(FIGURES)}.")
     wanted = [number, *([_SAME[number]] if number in _SAME else [])]
     for candidate in wanted:
         if task in FIGURES[candidate].cells:
             return candidate
     shown = ", ".join(task for candidate in wanted for task in FIGURES[candidate].cells)
-    raise flag.UsageError(f"Figure {number} does not show {task}; it shows {shown}.")
+    raise UsageError(f"Figure {number} does not show {task}; it shows {shown}.")

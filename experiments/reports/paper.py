@@ -12,7 +12,7 @@ import numpy as np
 
 FOLDER = Path(__file__).parents[1] / "paper"
 
-# Environment steps of a training run (experiments spec 2).
+# Environment steps of a training run.
 _BUDGETS = {
     "Grid World": 40e6,
     "Recommender": 40e6,
@@ -54,9 +54,10 @@ _ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"
 # Figure of a split that is not the domain's default, and what it appends to the names of methods.
 _SPLIT_FIGURES = {"full": ("fig7a_create_full_split", "")}
 _SPLIT_FIGURES_OF = {("Shape Stacking", "full"): ("fig23_stacking_variants", "full_split")}
-# Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
-# Methods whose train curves come from another simulator (experiments spec 15).
+# Methods whose train curves come from another simulator (docs/shape_stacking.md, "Against the paper
+# and its release").
 _OTHER_SIMULATOR = {"Shape Stacking": ("nearest_neighbor", "ours_no_subsampling")}
+# Actions in the sets of a bar, where they are not as many as in training.
 _SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
 
@@ -112,7 +113,7 @@ def paper_method(method: str, representation: str, variant: str = "") -> str | N
     Args:
       method: ours, such as `no-entropy`.
       representation: ours, such as `hvae`.
-      variant: of the domain or of the policy, see `Task.paper_variant`.
+      variant: of the domain or of the policy, see `Presentation.paper_variant`.
     """
     if method in _BASELINES and representation in _DEFAULT_REPRESENTATIONS:
         name: str | None = _BASELINES[method]
@@ -206,8 +207,8 @@ def paper_steps(environment: str) -> float:
 def paper_curve(environment: str, method: str, split: str) -> PaperCurve | None:
     """A learning curve up to the training budget; None if the paper shows none.
 
-    Every seed's curve is held at its maximum after it reached it, as the paper drew them (method
-    spec 11), so that its end is the mean of the seeds' best evaluations. What the released figures
+    Every seed's curve is held at its maximum after it reached it, as the paper drew them, so that
+    its end is the mean of the seeds' best evaluations. What the released figures
     draw past the budget is padding and left out.
 
     Args:
