@@ -203,7 +203,7 @@ class ActionSplit:
 
 
 def random_halves_split(universe: ActionUniverse, seed: int) -> ActionSplit:
-    """Random halves, the second cut in two: the paper's 2:1:1 (spec method 2.1).
+    """Random halves, the second cut in two: the paper's 2:1:1.
 
     Actions with equal content are kept on one side, so the parts are disjoint by content.
     """
@@ -233,7 +233,7 @@ def _group_by_content(universe: ActionUniverse) -> list[int]:
 
 
 def mixture_ids(seen: np.ndarray, unseen: np.ndarray, unseen_ratio: float) -> np.ndarray:
-    """A pool with about the given share of unseen actions (paper figure 9c, spec method 10).
+    """A pool with about the given share of unseen actions (paper figure 9c).
 
     The first `floor(x * |unseen|)` unseen and the first `floor((1 - x) * |seen|)` seen ids; sets
     drawn from it hold the share only on average, as in the released analysis.

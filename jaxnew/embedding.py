@@ -19,7 +19,8 @@ from jaxnew import collection, loop
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.observations import RecordingFormat, Recordings
 from jaxnew.representation import report
-from jaxnew.representation.learner import Modality, RepresentationLearner, RepresentationState
+from jaxnew.representation.learner import RepresentationLearner, RepresentationState
+from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
@@ -113,6 +114,7 @@ def collect(
     num_recordings: int,
     play: Play | None = None,
     stores_drawn: bool = False,
+    seed: int = REPRESENTATION_SEED,
 ) -> PlayRecordings:
     """Records every action of a domain below `runs`, from where it stands, and draws if asked to.
 
@@ -120,6 +122,7 @@ def collect(
       num_recordings: S, per action.
       play: which ones; default: the task's first.
       stores_drawn: see `StageOneBudget`; of no meaning for a play without a drawing.
+      seed: of the recordings.
 
     Raises:
       ObservationsError: see `jaxnew.collection.collect`.
@@ -136,16 +139,17 @@ def collect(
         universe=domain.universe,
         ids=ids,
         num_recordings=num_recordings,
-        seed=REPRESENTATION_SEED,
+        seed=seed,
         block_actions=play.block_actions,
     )
     if drawing is None or not stores_drawn:
         return PlayRecordings(play, recorded)
-    return PlayRecordings(play, recorded, _draw_all(folder, drawing, domain.universe, recorded))
+    drawn = _draw_all(folder, drawing, domain.universe, recorded, seed)
+    return PlayRecordings(play, recorded, drawn)
 
 
 def _draw_all(
-    folder: Path, drawing: Drawing, universe: ActionUniverse, recorded: Recordings
+    folder: Path, drawing: Drawing, universe: ActionUniverse, recorded: Recordings, seed: int
 ) -> Recordings:
     """All recordings, drawn into a directory of their own."""
     source = DrawnRecordings(recorded.data, recorded.ids, drawing.draw, drawing.format.shape)
@@ -160,7 +164,7 @@ def _draw_all(
         universe=universe,
         ids=recorded.ids,
         num_recordings=recorded.num_recordings,
-        seed=REPRESENTATION_SEED,
+        seed=seed,
         block_actions=1,  # Of frames, 1,024 recordings are 17 MB.
         play_settings={"drawn_from": recorded.hash},
     )

@@ -39,7 +39,7 @@ class ActionPool:
       always_available: int32[q] ids that stand in the first q slots of every set.
       group_starts: int32[G + 1] where each group of members begins and the last one ends, or None.
         With groups, a set is drawn from half of them (rounded down, at least one), which are drawn
-        first (spec method 2.2, cluster sampling).
+        first (docs/method.md, "Validation groups and cluster sampling").
     """
 
     ids: jax.Array

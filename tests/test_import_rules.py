@@ -21,7 +21,7 @@ LAYERS = (
         *("actions", "observations"),
         *("checkpoint", "config", "cores", "metrics", "run_directory"),
     },
-    {"sampling", "environment"},
+    {"sampling", "environment", "convolution"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation", "host_evaluation"},

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,8 +9,11 @@ import numpy as np
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.environment import ActionSpec, ObservationSpec
 from jaxnew.ppo import Hyperparameters, PPOConfig
-from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import ActionStudy, Film, HostDomain, LoopConfig, StageTwoBudget, Task
+from jaxnew.rollout.contract import Episode, RolloutConfig
+from jaxnew.sampling import SetConfig
+from jaxnew.task.budgets import LoopConfig, StageTwoBudget
+from jaxnew.task.presentation import ActionStudy, Film, Filming, Presentation
+from jaxnew.task.task import HostDomain, Task
 from tests import toy_host
 
 A, NO_OP = toy_host.NUM_ACTIONS, toy_host.NUM_ACTIONS - 1
@@ -49,15 +51,15 @@ def make_pool(**arguments: Any) -> toy_host.ToyPool:
     return toy_host.ToyPool(**arguments)
 
 
-def make_film(
-    seed: np.random.SeedSequence, ids: np.ndarray, positions: np.ndarray, *, size: int
-) -> Film:
+def draw(settings: None, episode: Episode, *, size: int) -> Film:
     """The frames of an episode in red, and a last one that is green after a success."""
+    assert settings is None
+    assert episode.seed is not None
     env = toy_host.ToyEnv()
     scale = size // toy_host.SIZE
-    frames = [env.reset(seed)]
-    for action_id, position in zip(ids, positions, strict=True):
-        frame, _, _, _, metrics = env.step(int(action_id), position)
+    frames = [env.reset(episode.seed)]
+    for action in episode.actions:
+        frame, _, _, _, metrics = env.step(int(action.id), np.asarray(action.position))
         frames.append(frame)
     colored = np.zeros((len(frames) + 1, size, size, 3), np.uint8)
     colored[:-1, ..., 0] = np.kron(frames, np.ones((1, scale, scale)))
@@ -78,7 +80,6 @@ _SMOKE = StageTwoBudget(
         rollout=RolloutConfig(
             num_envs=4,
             num_steps=8,
-            set_size=4,
             normalize_observations=False,
             normalize_rewards=False,
         ),
@@ -87,6 +88,7 @@ _SMOKE = StageTwoBudget(
         microbatch_size=0,
         lr_steps=1024,
     ),
+    sets=SetConfig(4),
     hyperparameters=Hyperparameters(entropy_coefficient=0.005),
     loop=LoopConfig(chunk_updates=1, evaluate_every=2, evaluation_episodes=6, checkpoint_every=1),
     final_episodes=8,
@@ -101,19 +103,21 @@ TASK = Task(
         make_pool=make_pool,
         action_spec=ActionSpec(A, position_dim=2),
         observation_spec=ObservationSpec((toy_host.SIZE, toy_host.SIZE), np.uint8, 0, 255),
-        max_episode_steps=toy_host.MAX_STEPS,
+        max_episode_steps=lambda settings: toy_host.MAX_STEPS,
         stack_size=3,
-        make_film=make_film,
     ),
-    stage_two={"smoke": _SMOKE, "longer": replace(_SMOKE, num_updates=40)},
-    studies={
-        "goodness": ActionStudy(
-            "share of good actions",
-            (0.0, 0.5, 1.0),
-            even_share,
-            "Good actions are worth something.",
-            lambda value: f"ours_analysis[unseen_fraction={value:.1f}]",
-            figure="9c",
-        )
-    },
+    stage_two={"smoke": _SMOKE, "longer": _SMOKE.vary(num_updates=40)},
+    shown=Presentation(
+        studies={
+            "goodness": ActionStudy(
+                "share of good actions",
+                (0.0, 0.5, 1.0),
+                even_share,
+                "Good actions are worth something.",
+                lambda value: f"ours_analysis[unseen_fraction={value:.1f}]",
+                figure="9c",
+            )
+        },
+        filming=Filming(draw),
+    ),
 )

@@ -15,7 +15,8 @@ from envs_host.create.tools import no_op_id
 from jaxnew.observations import RecordingFormat
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import image_modality, vector_modality
-from jaxnew.task import Drawing, Play, StageOneBudget
+from jaxnew.task.budgets import StageOneBudget
+from jaxnew.task.task import Drawing, Play
 from tests import toy_host, toy_task
 
 FIRST, NUM_FRAMES = 3, 2
@@ -48,12 +49,11 @@ _HVAE = RepresentationConfig(
 )
 _SMOKE = StageOneBudget(
     num_recordings=3,
-    configs={"hvae": _HVAE, "vae": replace(_HVAE, kind="vae")},
-    chunk_steps=1,
+    hvae=_HVAE,
+    vae=replace(_HVAE, kind="vae"),
     checkpoint_every=1,
     cost="seconds",
 )
-_STATES = replace(_HVAE, num_steps=2)
 STATES = Play(
     format=RecordingFormat("Toy play, states", (7, 6), "float32"),
     record_block=record_states,
@@ -76,7 +76,6 @@ VIDEO = Play(
 TASK = replace(
     toy_task.TASK,
     name="toy-video",
-    play=STATES,
-    more_plays=(VIDEO,),
-    stage_one={"smoke": replace(_SMOKE, configs={"hvae": _STATES})},
+    plays=(STATES, VIDEO),
+    stage_one={"smoke": _SMOKE.vary(hvae__num_steps=2)},
 )

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 
 from experiments.benchmarks import _measure as m
-from jaxnew._convolution import convolution_by_columns, convolution_by_xla
+from jaxnew.convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.policy.state_encoder import ImageEncoder
 
 FORMS = {"columns": convolution_by_columns, "XLA": convolution_by_xla}

@@ -1,4 +1,6 @@
-"""What comes with a choice in hybrid domains: a position and a stop bit (spec method 5.4, 5.5).
+"""What comes with a choice in hybrid domains: a position and a stop bit.
+
+`docs/method.md`, "Auxiliary heads".
 
 The position has a Beta distribution per coordinate, `u` in (0, 1); what is executed is
 `2 (u - 0.5)` in (-1, 1). Its parameters are `1 + softplus(x)`, above 1, so that the density has no
@@ -21,13 +23,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action, ActionSpec
-from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Beta, Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, apply, orthogonal_dense
+from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, apply, orthogonal_dense
 from jaxnew.policy.utility import HIDDEN_SIZE, UtilityMethod
 from jaxnew.sampling import AvailableSet
 
-POSITION_ENTROPY_WEIGHT = 0.1  # Spec method 5.4: inside the entropy, beside its coefficient.
+POSITION_ENTROPY_WEIGHT = 0.1  # Inside the entropy, beside its coefficient.
 _POSITION_GAIN = 1.0
 _STOP_GAIN = 0.01
 _STOP = 1  # Index of the logit that ends the episode.

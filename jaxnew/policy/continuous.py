@@ -1,4 +1,7 @@
-"""The continuous-output baseline: a point in the space of representations (spec method 8.1)."""
+"""The continuous-output baseline: a point in the space of representations.
+
+`docs/method.md`, "Baselines and ablations".
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,12 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action
-from jaxnew.policy._features import FeatureMethod
-from jaxnew.policy._nearest import nearest_id
-from jaxnew.policy.state_encoder import StateEncoder, apply, orthogonal_dense
+from jaxnew.policy.distributions import nearest_id
+from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
 _LOG_TWO_PI = 1.8378770664093453
-_LOG_PROB_BOUND = 1e5  # Spec method 8.1: only ever reached in the hybrid environments.
+_LOG_PROB_BOUND = 1e5  # Only ever reached in the hybrid environments.
 
 
 @struct.dataclass

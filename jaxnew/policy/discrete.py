@@ -1,4 +1,7 @@
-"""A discrete policy over the train actions; elsewhere the nearest action acts (spec method 8.2)."""
+"""A discrete policy over the train actions; elsewhere the nearest action acts.
+
+`docs/method.md`, "Baselines and ablations".
+"""
 
 from __future__ import annotations
 
@@ -10,13 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.environment import Action
-from jaxnew.policy._features import FeatureMethod
-from jaxnew.policy._nearest import nearest_id
-from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import StateEncoder, apply, orthogonal_dense
+from jaxnew.policy.distributions import Categorical, nearest_id
+from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
 
-_HEAD_GAIN = 0.01  # Spec method 8.2.
+_HEAD_GAIN = 0.01
 
 
 class _DiscretePolicy(nn.Module):

@@ -1,4 +1,4 @@
-"""Probability distributions over choices and positions, in float32 and safe with masks."""
+"""Distributions over choices and positions, and the choice nearest to a point; safe with masks."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 from jax.scipy.special import betaln, digamma
+
+from jaxnew.sampling import AvailableSet
 
 MASKED_LOGIT = -1e9  # Finite, so that a set with every entry masked has no NaN.
 
@@ -93,3 +95,18 @@ class Beta:
     def mode(self) -> jax.Array:
         """f32[..., k] the mean: what the release takes for the most likely position."""
         return self.alpha / (self.alpha + self.beta)
+
+
+def nearest_id(points: jax.Array, available: AvailableSet, table: jax.Array) -> jax.Array:
+    """int32[...] ids of the available actions with the smallest squared L2 distance.
+
+    The first in the set wins a tie.
+
+    Args:
+      points: f32[..., d].
+      available: sets [..., m], or one set [m] for all points.
+      table: f32[A, d] representations.
+    """
+    differences = table[available.ids] - points[..., None, :]
+    distances = jnp.sum(differences**2, axis=-1)
+    return available.id_of(jnp.argmin(jnp.where(available.mask, distances, jnp.inf), axis=-1))

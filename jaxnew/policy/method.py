@@ -20,30 +20,27 @@ Params = Any
 
 
 class Distribution(Protocol):
-    """A distribution over samples; a sample is a pytree, stored as it is by PPO.
+    """A distribution over samples; a sample is a pytree, stored as it is by PPO."""
 
-    `entropy` is given the sample that was drawn: a part that is conditioned on another has the
-    entropy that it has there (spec method 5.5).
-    """
+    def sample(self, key: jax.Array) -> Any:
+        """A draw for every state [...]; consumes `key`."""
+        ...
 
-    def sample(self, key: jax.Array) -> Any: ...
+    def log_prob(self, sample: Any) -> jax.Array:
+        """f32[...] log-probability or log-density of a sample."""
+        ...
 
-    def log_prob(self, sample: Any) -> jax.Array: ...
+    def entropy(self, sample: Any = None) -> jax.Array:
+        """f32[...] nats; a part that is conditioned on another has those at `sample`."""
+        ...
 
-    def entropy(self, sample: Any = None) -> jax.Array: ...
-
-    def mode(self) -> Any: ...
+    def mode(self) -> Any:
+        """The sample that a greedy evaluation takes."""
+        ...
 
 
 class PolicyMethod(Protocol):
     """A policy as pure functions of its parameters.
-
-    `project` is the part that depends on an action alone. It is computed once per gradient step for
-    the whole table; the rows of the available actions are then gathered and handed to
-    `distribution`. A method with no such part returns the representations unchanged.
-
-    `decode` turns a sample into an action of the available set; `table` f32[A, d] holds the
-    representations of all actions, for methods whose sample is not a choice from the set.
 
     A method whose distribution and value share work may have `distribution_and_value` as well, with
     the arguments of `distribution`.
@@ -51,17 +48,45 @@ class PolicyMethod(Protocol):
 
     name: str
 
-    def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> Params: ...
+    def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> Params:
+        """Fresh parameters for an observation like `obs` and rows of size d; consumes `key`."""
+        ...
 
-    def project(self, params: Params, representations: jax.Array) -> jax.Array: ...
+    def project(self, params: Params, representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., p]: the part of the work that depends on an action alone.
+
+        Computed once per gradient step for the whole table; the rows of the available actions are
+        then gathered. A method with no such part returns the representations unchanged.
+        """
+        ...
 
     def distribution(
         self, params: Params, obs: jax.Array, projected: jax.Array, mask: jax.Array
-    ) -> Distribution: ...
+    ) -> Distribution:
+        """What is sampled from.
 
-    def value(self, params: Params, obs: jax.Array) -> jax.Array: ...
+        Args:
+          params: as `init` makes them.
+          obs: f32[..., n] normalised observations, or uint8[..., H, W, C] images.
+          projected: f32[..., m, p] `project` of the available representations.
+          mask: bool[..., m] true for a real entry of the set.
+        """
+        ...
 
-    def decode(self, sample: Any, available: AvailableSet, table: jax.Array) -> Action: ...
+    def value(self, params: Params, obs: jax.Array) -> jax.Array:
+        """f32[...] values of observations, as in `distribution`."""
+        ...
+
+    def decode(self, sample: Any, available: AvailableSet, table: jax.Array) -> Action:
+        """The available action that a sample means.
+
+        Args:
+          sample: of `distribution`.
+          available: sets [..., m], or one set [m] for all samples.
+          table: f32[A, d] representations of all actions, for methods whose sample is not a choice
+            from the set.
+        """
+        ...
 
 
 def distribution_and_value(
@@ -82,9 +107,9 @@ class MethodContext:
     Attributes:
       train_ids: int32[n] ids of the fixed action space of a discrete policy.
       sums_gaussian_entropy: whether the entropy of a continuous output is summed over its
-        dimensions, as in Grid World, or averaged, as elsewhere (spec method 8.1).
+        dimensions, as in Grid World, or averaged, as elsewhere.
       action_spec: of the domain; what comes with a choice there gets heads. None: nothing does.
-      conditions_position: the position's head reads the chosen action too (spec method 5.5).
+      conditions_position: the position's head reads the chosen action too.
     """
 
     train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -111,7 +136,7 @@ def make_method(name: str, context: MethodContext | None = None) -> PolicyMethod
         raise ValueError(f"Unknown method {name!r}; choose one of {sorted(METHODS)}.")
     context = context or MethodContext()
     method = METHODS[name](context)
-    spec = context.action_spec
-    if context.conditions_position or (spec and (spec.position_dim or spec.has_stop)):
-        return AuxiliaryMethod(method, spec or ActionSpec(0), context.conditions_position)
+    actions = context.action_spec or ActionSpec(0)
+    if context.conditions_position or actions.position_dim or actions.has_stop:
+        return AuxiliaryMethod(method, actions, context.conditions_position)
     return method

@@ -1,4 +1,4 @@
-"""State features and values (spec method 5.2), for vectors and for images.
+"""State features and values, for vectors and for images (`docs/method.md`, "Policy networks").
 
 Which of the two an observation is shows in its dtype: `uint8` is an image. Images stay `uint8` in
 rollouts and are divided by 255 here.
@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnew._convolution import WINDOW, convolution
+from jaxnew.convolution import WINDOW, convolution
 
 FEATURE_SIZE = 64  # Width of the state feature f(s).
 _SQRT_2 = float(np.sqrt(2.0))
@@ -46,11 +46,11 @@ def orthogonal_dense(features: int, gain: float, name: str | None = None) -> nn.
 class StridedConvolution(nn.Module):
     """A 3x3 convolution with stride 2, padding 1 and a bias; PyTorch's default initialisation.
 
-    Weights and bias are uniform in +-1/sqrt(9 C) (spec method 5.2).
+    Weights and bias are uniform in +-1/sqrt(9 C).
 
     Attributes:
       features: O.
-      form: of `jaxnew._convolution`.
+      form: of `jaxnew.convolution`.
     """
 
     features: int
@@ -78,13 +78,14 @@ class ImageEncoder(nn.Module):
     the dense layer's weight and changes nothing else.
 
     Attributes:
-      form: of the convolutions, see `jaxnew._convolution`.
+      form: of the convolutions, see `jaxnew.convolution`.
     """
 
     form: Callable[[jax.Array, jax.Array, int], jax.Array] = convolution
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
+        """State features f32[..., 64] of images uint8[..., H, W, C]."""
         x = obs.reshape(-1, *obs.shape[-3:]).astype(jnp.float32) / 255.0
         for index, channels in enumerate(_CHANNELS):
             x = nn.relu(StridedConvolution(channels, self.form, name=f"convolution_{index}")(x))
@@ -118,7 +119,7 @@ class StateCritic(nn.Module):
     """The value f32[...] of a state. Blind to the action set.
 
     Of vectors by an encoder of its own; of images from the state feature of the policy, which its
-    gradient reaches (spec method 5.2).
+    gradient reaches.
     """
 
     @nn.compact
@@ -131,3 +132,48 @@ class StateCritic(nn.Module):
 def apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) -> jax.Array:
     """The output of `module` with `params`."""
     return cast(jax.Array, module.apply({"params": params}, *inputs, **options))
+
+
+class FeatureMethod:
+    """Base of methods that have `features` and `distribution_of`, and keep a critic's parameters in
+    `params["critic"]`."""
+
+    _critic = StateCritic()
+
+    def init_critic(self, key: jax.Array, obs: jax.Array) -> Any:
+        """Fresh parameters of the critic; consumes `key`."""
+        return self._critic.init(key, obs, jnp.zeros(FEATURE_SIZE))["params"]
+
+    def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[..., 64] the state feature."""
+        raise NotImplementedError
+
+    def distribution_of(
+        self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Any:
+        """`distribution` from the state feature f32[..., 64]."""
+        raise NotImplementedError
+
+    def distribution(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> Any:
+        """See `jaxnew.policy.method.PolicyMethod`."""
+        return self.distribution_of(params, self.features(params, obs), projected, mask)
+
+    def value(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
+        """f32[...] values of observations, as in `distribution`."""
+        return self.value_of(params, obs, self.features(params, obs))
+
+    def value_of(self, params: dict[str, Any], obs: jax.Array, features: jax.Array) -> jax.Array:
+        """`value` where the state feature is known."""
+        return apply(self._critic, params["critic"], obs, features)
+
+    def distribution_and_value(
+        self, params: dict[str, Any], obs: jax.Array, projected: jax.Array, mask: jax.Array
+    ) -> tuple[Any, jax.Array]:
+        """Both; of images with one pass, and one backward pass, through the trunk they share."""
+        if not is_image(obs):
+            return self.distribution(params, obs, projected, mask), self.value(params, obs)
+        features = self.features(params, obs)
+        distribution = self.distribution_of(params, features, projected, mask)
+        return distribution, self.value_of(params, obs, features)

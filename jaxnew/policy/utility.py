@@ -1,4 +1,4 @@
-"""The utility policy (paper section 4.3, spec method 5.3): scores each action of any set.
+"""The utility policy (paper section 4.2): scores each action of any set.
 
 The utility of an action with representation `c` in a state with feature `f` is
 
@@ -20,13 +20,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxnew.environment import Action
-from jaxnew.policy._features import FeatureMethod
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, StateEncoder, apply
+from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 HIDDEN_SIZE = 64
-_UTILITY_GAIN = 0.01  # Spec method 5.3: the initial policy is almost exactly uniform.
+_UTILITY_GAIN = 0.01  # The initial policy is almost exactly uniform.
 
 
 class Utility(nn.Module):
@@ -121,7 +120,7 @@ class UtilityMethod(FeatureMethod):
 class RandomMethod(UtilityMethod):
     """Uniform over the available actions, whatever its parameters. For reference; does not learn.
 
-    The release draws logits from U(0, 1) anew at every step (spec method 5.5): as they are
+    The release draws logits from U(0, 1) anew at every step: as they are
     exchangeable, every action is as likely as any other.
     """
 

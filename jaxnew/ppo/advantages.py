@@ -16,7 +16,7 @@ def gae(
     discount: jax.Array | float,
     lam: jax.Array | float,
 ) -> tuple[jax.Array, jax.Array]:
-    """Generalised advantage estimates, bootstrapping through time limits (spec method 6).
+    """Generalised advantage estimates, bootstrapping through time limits.
 
     Args:
       rewards: f32[T, N] reward after each step.

@@ -21,8 +21,8 @@ class PPOConfig:
         images, 16.
       lr_steps: environment steps over which the learning rate falls to a tenth.
       max_grad_norm: bound on the global norm of the gradient.
-      time_limits_are_ends: nothing is bootstrapped through a time limit. Spec method 6: the
-        reported runs treated every end alike.
+      time_limits_are_ends: nothing is bootstrapped through a time limit. The paper's reported
+        runs treated every end alike.
     """
 
     rollout: RolloutConfig = field(default_factory=RolloutConfig)
@@ -71,5 +71,5 @@ class PPOConfig:
 
     @property
     def lr_updates(self) -> int:
-        """Updates over which the learning rate falls (J of spec method 6)."""
+        """Updates over which the learning rate falls."""
         return self.lr_steps // self.steps_per_update

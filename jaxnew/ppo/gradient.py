@@ -1,4 +1,4 @@
-"""The gradient steps of PPO (spec method 6), wherever the rollout was made."""
+"""The gradient steps of PPO (docs/method.md, "PPO"), wherever the rollout was made."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ class GradientSteps:
         return params, opt_state, {**metrics, **nonfinite}
 
     def _learning_rate_factor(self, step: jax.Array) -> jax.Array:
-        """Linear from 1 to 0.1 over `lr_updates`, then constant (spec method 6)."""
+        """Linear from 1 to 0.1 over `lr_updates`, then constant."""
         return 1.0 - 0.9 * jnp.minimum(1.0, step / self.config.lr_updates)
 
     def _minibatch_indices(self, key: jax.Array) -> jax.Array:

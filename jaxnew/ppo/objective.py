@@ -1,4 +1,4 @@
-"""The PPO objective (spec method 6)."""
+"""The PPO objective (docs/method.md, "PPO")."""
 
 from __future__ import annotations
 

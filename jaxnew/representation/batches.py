@@ -5,10 +5,14 @@ Batches can be recomputed for any step, so a resumed run sees what an uninterrup
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+
+from jaxnew.representation.config import RepresentationConfig
+from jaxnew.representation.modality import Modality
 
 
 class Choice(NamedTuple):
@@ -33,8 +37,7 @@ def hvae_choice(
 ) -> Choice:
     """One HVAE batch: B of A actions, S recordings of each, both without replacement.
 
-    An epoch is one shuffled pass over the actions, its last incomplete batch dropped (spec
-    method 3).
+    An epoch is one shuffled pass over the actions, its last incomplete batch dropped.
 
     Args:
       key_epochs: typed key; epoch e is shuffled with `fold_in(key_epochs, e)`.
@@ -55,7 +58,7 @@ def hvae_choice(
 
 
 def flat_vae_choice(key_step: jax.Array, shape: tuple[int, ...], num_recordings: int) -> Choice:
-    """One flat-VAE batch: recordings of all actions alike, drawn with replacement (spec method 4).
+    """One flat-VAE batch: recordings of all actions alike, drawn with replacement.
 
     Args:
       key_step: typed key of this step, consumed.
@@ -64,3 +67,70 @@ def flat_vae_choice(key_step: jax.Array, shape: tuple[int, ...], num_recordings:
     """
     chosen = jax.random.randint(key_step, (1, num_recordings), 0, shape[0] * shape[1])
     return Choice(*jnp.divmod(chosen, shape[1]))
+
+
+@dataclass(frozen=True)
+class Batches:
+    """How the batches of a training are drawn.
+
+    Attributes:
+      are_pooled: from the recordings of all actions alike. So the flat VAE learns from
+        trajectories; of images it has the batches of the HVAE.
+      actions_per_batch: B.
+      recordings_per_action: S.
+    """
+
+    are_pooled: bool
+    actions_per_batch: int
+    recordings_per_action: int
+
+    @classmethod
+    def of(cls, config: RepresentationConfig, modality: Modality) -> Batches:
+        """Those that a config asks for."""
+        are_pooled = config.kind == "vae" and modality.image_shape is None
+        return cls(are_pooled, config.actions_per_batch, config.recordings_per_action)
+
+    def pooled_size(self, num_actions: int) -> int:
+        """Recordings of a batch from all of A actions: `A * floor(B * S / A)`."""
+        return self.actions_per_batch * self.recordings_per_action // num_actions * num_actions
+
+    def check(self, num_actions: int, num_recordings: int) -> None:
+        """Raises unless batches can be drawn from `num_recordings` of each of `num_actions`.
+
+        Raises:
+          ValueError: there are too few actions or recordings, or pooled batches are too small.
+        """
+        if self.are_pooled:
+            if self.pooled_size(num_actions) < 1:
+                raise ValueError(
+                    f"actions_per_batch * recordings_per_action = "
+                    f"{self.actions_per_batch * self.recordings_per_action} is less than the "
+                    f"{num_actions} train actions; the flat VAE needs at least one recording per "
+                    "action and step. Raise either field."
+                )
+            return
+        if num_actions < self.actions_per_batch:
+            raise ValueError(
+                f"actions_per_batch={self.actions_per_batch} exceeds the {num_actions} train "
+                f"actions; set it to at most {num_actions}."
+            )
+        if num_recordings < self.recordings_per_action:
+            raise ValueError(
+                f"recordings_per_action={self.recordings_per_action} exceeds the "
+                f"{num_recordings} recordings per action; set it to at most {num_recordings} or "
+                "collect more recordings."
+            )
+
+    def epoch(self, step: jax.Array, num_actions: int | jax.Array) -> jax.Array:
+        """int32[] the epoch of a step int32[]; every pooled batch is an epoch of its own."""
+        return step if self.are_pooled else step // (num_actions // self.actions_per_batch)
+
+    def choice(
+        self, key_epochs: jax.Array, key_step: jax.Array, step: jax.Array, shape: tuple[int, ...]
+    ) -> Choice:
+        """What a step sees; arguments as of `hvae_choice`."""
+        if self.are_pooled:
+            return flat_vae_choice(key_step, shape, self.pooled_size(shape[0]))
+        return hvae_choice(
+            key_epochs, key_step, step, shape, self.actions_per_batch, self.recordings_per_action
+        )

@@ -1,4 +1,7 @@
-"""Clusters of representations of equal size, for cluster sampling (spec method 2.2). NumPy only."""
+"""Clusters of representations of equal size, for cluster sampling. NumPy only.
+
+`docs/method.md`, "Validation groups and cluster sampling".
+"""
 
 from __future__ import annotations
 

@@ -9,10 +9,12 @@ KINDS = ("hvae", "vae")
 
 @dataclass(frozen=True)
 class RepresentationConfig:
-    """Hyper-parameters of stage 1; the defaults are those of Grid World (spec method 3).
+    """Hyper-parameters of stage 1; the defaults are those of Grid World.
+
+    `docs/method.md`, "HVAE", has those of all domains.
 
     Attributes:
-      kind: "hvae" or "vae" (the flat baseline, spec method 4).
+      kind: "hvae" or "vae" (the flat baseline).
       encoder_width: E, hidden width of the recording encoder per direction.
       inference_width: Ho, hidden width of the action inference network (HVAE only).
       hidden_width: H, hidden width of all other networks.

@@ -1,4 +1,4 @@
-"""Networks that predict recordings from latents (spec method 3.6)."""
+"""Networks that predict recordings from latents (`docs/method.md`, "HVAE")."""
 
 from __future__ import annotations
 
@@ -12,8 +12,7 @@ from jaxnew.representation.encoders import Dense, LSTMWeights, ResBlock, lstm_ce
 class DecoderStart(nn.Module):
     """Latents -> the features `g` that every decoder starts from.
 
-    `g = ReLU(Lin(z) + Lin(c))`; the flat VAE has no action latent: `g = ReLU(Lin(z))` (spec
-    method 3.6 and 4).
+    `g = ReLU(Lin(z) + Lin(c))`; the flat VAE has no action latent: `g = ReLU(Lin(z))`.
 
     Attributes:
       width: H.
@@ -35,7 +34,7 @@ class DecoderStart(nn.Module):
 class TrajectoryDecoder(nn.Module):
     """Predicts steps 1..T-1 of a recording from its step 0, feeding back its own predictions.
 
-    Spec method 3.6, "Sequences". For one-hot features the predictions are raw logits, and raw
+    For one-hot features the predictions are raw logits, and raw
     logits are fed back.
 
     Attributes:

@@ -19,10 +19,10 @@ from flax import linen as nn
 
 Initializer = Callable[..., jax.Array]
 
-# Spec method 3.1: Xavier-normal with gain sqrt(2), that is std = 2 / sqrt(fan_in + fan_out).
+# Xavier-normal with gain sqrt(2), that is std = 2 / sqrt(fan_in + fan_out).
 xavier_normal: Initializer = nn.initializers.variance_scaling(2.0, "fan_avg", "normal")
 
-# Free log-variance vectors start from N(0, 1) (spec method 3.1).
+# Free log-variance vectors start from N(0, 1).
 free_log_variance: Initializer = nn.initializers.normal(1.0)
 
 
@@ -36,13 +36,13 @@ def uniform_within(bound: float) -> Initializer:
 
 
 class Dense(nn.Module):
-    """Affine map of the leading axis: the `Lin(i, o)` of the spec.
+    """Affine map of the leading axis: `Lin(i, o)` in `docs/method.md`, "HVAE".
 
     Attributes:
       features: o.
-      pytorch_init: False for the Xavier-normal weights and zero bias of the HVAE (spec method
-        3.1); True for PyTorch's defaults, weights and bias uniform in +-1/sqrt(i), which the flat
-        VAE keeps (spec method 4).
+      pytorch_init: False for the Xavier-normal weights and zero bias of the HVAE;
+        True for PyTorch's defaults, weights and bias uniform in +-1/sqrt(i), which the flat
+        VAE keeps.
     """
 
     features: int
@@ -64,7 +64,7 @@ class Dense(nn.Module):
 class ResBlock(nn.Module):
     """`ReLU(e + x)`, where `e` is `num_layers` dense layers with ReLU between them, not after.
 
-    The `Res(n, w)` of spec method 3.1.
+    `Res(n, w)` in `docs/method.md`, "HVAE".
 
     Attributes:
       num_layers: n.
@@ -86,9 +86,9 @@ class ResBlock(nn.Module):
 class ScalarBatchNorm(nn.Module):
     """Batch norm with one feature: all numbers share one mean, variance, scale and shift.
 
-    `BN1` of spec method 3.1: eps 1e-3, running averages keep 0.99. PyTorch feeds its running
-    variance with the unbiased batch variance, this one (as Flax does) with the biased one; with
-    the n >= 2,000 numbers of a batch here they differ by less than 0.05 %.
+    `BN1` in `docs/method.md`, "HVAE": eps 1e-3, running averages keep 0.99. PyTorch feeds
+    its running variance with the unbiased batch variance, this one (as Flax does) with the biased
+    one; with the n >= 2,000 numbers of a batch here they differ by less than 0.05 %.
     """
 
     @nn.compact
@@ -186,7 +186,7 @@ def _run_direction(
 
 
 class TrajectoryEncoder(nn.Module):
-    """Recordings of vectors over time -> one vector each (spec method 3.2, steps 2 and 3).
+    """Recordings of vectors over time -> one vector each.
 
     Two bidirectional LSTM layers; the top layer's outputs are averaged over time and directions.
 
@@ -213,8 +213,7 @@ class LatentHead(nn.Module):
     """Hidden features -> a diagonal Gaussian whose log-variance is one free vector.
 
     `Res(2, H)`, `Res(2, H)`, `Lin(H, dz)`, `BN1` gives the mean; the log-variance is learned and
-    shared by all inputs (spec methods 3.4, 3.5 and 4). The paper says that the network outputs it;
-    spec method 12, row 2, follows the release.
+    shared by all inputs, as in the release; the paper says that the network outputs it.
 
     Attributes:
       latent: dz.

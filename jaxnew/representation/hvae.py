@@ -1,7 +1,8 @@
-"""The hierarchical VAE: a set of recordings -> one latent per action (spec method 3, paper 4.1).
+"""The hierarchical VAE: a set of recordings -> one latent per action (paper section 4.1).
 
-Both networks `q(z | o, c)` and `p(z | c)` of the release hold one more dense layer, for a second
-stochastic layer that is never used (spec method 3.5); it is left out here.
+`docs/method.md`, "HVAE", has the layers, and their blocks `Lin`, `Res` and `BN1`. Both networks
+`q(z | o, c)` and `p(z | c)` of the release hold one more dense layer, for a second stochastic layer
+that is never used; it is left out here.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gauss
 
 
 class ActionInference(nn.Module):
-    """`q(c | O)`: encoded recordings of an action -> a Gaussian (spec method 3.3).
+    """`q(c | O)`: encoded recordings of an action -> a Gaussian.
 
     Attributes:
       width: Ho.
@@ -42,7 +43,7 @@ class ActionInference(nn.Module):
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
         """f32[E, B, S] -> (mean f32[dc, B], log-variance f32[dc, B]); blind to the order of S."""
         e = ResBlock(2)(nn.relu(Dense(self.width)(h)))
-        # Spec 3.3 has Lin, then the mean over S. The two commute, and this order is cheaper.
+        # The release has Lin, then the mean over S. The two commute; this order is cheaper.
         e = Dense(self.width)(jnp.mean(e, axis=-1))
         e = Dense(2 * self.latent)(ResBlock(3)(e))
         mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2)
@@ -50,7 +51,7 @@ class ActionInference(nn.Module):
 
 
 class ObservationInference(nn.Module):
-    """`q(z | o, c)`: an encoded recording and its action -> a Gaussian (spec method 3.4).
+    """`q(z | o, c)`: an encoded recording and its action -> a Gaussian.
 
     Attributes:
       width: H.
@@ -70,7 +71,7 @@ class ObservationInference(nn.Module):
 
 
 class LatentPrior(nn.Module):
-    """`p(z | c)` (spec method 3.5).
+    """`p(z | c)`.
 
     Attributes:
       width: H.

@@ -1,4 +1,4 @@
-"""Recordings that are images: videos, and still images (spec method 3.2, 3.6).
+"""Recordings that are images: videos, and still images (`docs/method.md`, "HVAE").
 
 Frames become 288 numbers by convolutions, and predicted numbers become frames by convolutions; what
 lies between them is that of trajectories. Where the networks flatten 3x3 pixels of 32 channels, the
@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew._convolution import WINDOW, convolution
+from jaxnew.convolution import WINDOW, convolution
 from jaxnew.representation.decoders import TrajectoryDecoder
 from jaxnew.representation.encoders import Dense, ResBlock, TrajectoryEncoder, uniform_within
 
@@ -98,7 +98,7 @@ def _without_border(images: jax.Array, border: int) -> jax.Array:
 
 
 class Convolution(nn.Module):
-    """A 3x3 convolution with padding 1; PyTorch's default initialisation (spec method 3.1).
+    """A 3x3 convolution with padding 1; PyTorch's default initialisation.
 
     Attributes:
       features: O.
@@ -119,7 +119,7 @@ class Convolution(nn.Module):
 class TransposedConvolution(nn.Module):
     """`transposed_convolution` with a bias; PyTorch's default initialisation.
 
-    PyTorch counts `O k^2` inputs here (spec method 3.1).
+    PyTorch counts `O k^2` inputs here.
 
     Attributes:
       layer: its sizes.
@@ -137,7 +137,7 @@ class TransposedConvolution(nn.Module):
 
 
 class ChannelBatchNorm(nn.Module):
-    """Batch norm per channel: the `BN2d` of spec method 3.1, eps 1e-5, running averages keep 0.9.
+    """Batch norm per channel: the method's `BN2d`, eps 1e-5, running averages keep 0.9.
 
     PyTorch feeds its running variance with the unbiased batch variance, this one with the biased.
     """
@@ -162,7 +162,7 @@ class FrameEncoder(nn.Module):
 
 
 class FrameDecoder(nn.Module):
-    """288 numbers -> an image and a mask (spec method 3.6, "Convolutional decoder").
+    """288 numbers -> an image and a mask.
 
     Attributes:
       image_shape: (side, side, C).

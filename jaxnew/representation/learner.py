@@ -11,8 +11,7 @@ import numpy as np
 import optax
 from flax import struct
 
-from jaxnew.representation._models import build_model
-from jaxnew.representation.batches import Choice, flat_vae_choice, hvae_choice
+from jaxnew.representation.batches import Batches, Choice
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.objective import (
@@ -24,6 +23,7 @@ from jaxnew.representation.objective import (
     weighted_loss,
 )
 from jaxnew.representation.sources import RecordingSource, padded_chunks
+from jaxnew.representation.vae import build_model
 
 __all__ = ["Modality", "RepresentationConfig", "RepresentationLearner", "RepresentationState"]
 
@@ -68,7 +68,8 @@ class RepresentationLearner:
         self.config = config
         self.modality = modality
         self._model = build_model(config, modality)
-        # Spec method 3.7: elementwise clamp, then RAdam with betas 0.9 and 0.999, eps 1e-8.
+        self._batches = Batches.of(config, modality)
+        # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
         self._optimizer = optax.chain(
             optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
         )
@@ -190,43 +191,12 @@ class RepresentationLearner:
             raise ValueError(
                 f"recordings must be {self._recordings_form}{steps}, got shape {tuple(shape)}."
             )
-        config, (num_actions, num_recordings) = self.config, shape[:2]
-        if self._pools_recordings:
-            if self._flat_batch_size(num_actions) < 1:
-                raise ValueError(
-                    f"actions_per_batch * recordings_per_action = "
-                    f"{config.actions_per_batch * config.recordings_per_action} is less than the "
-                    f"{num_actions} train actions; the flat VAE needs at least one recording per "
-                    "action and step. Raise either field."
-                )
-            return
-        if num_actions < config.actions_per_batch:
-            raise ValueError(
-                f"actions_per_batch={config.actions_per_batch} exceeds the {num_actions} train "
-                f"actions; set it to at most {num_actions}."
-            )
-        if num_recordings < config.recordings_per_action:
-            raise ValueError(
-                f"recordings_per_action={config.recordings_per_action} exceeds the "
-                f"{num_recordings} recordings per action; set it to at most {num_recordings} or "
-                "collect more recordings."
-            )
+        self._batches.check(shape[0], shape[1])
 
     @property
     def _recordings_form(self) -> str:
         last = {2: "T, D0", 3: "height, width, channels", 4: "T, height, width, channels"}
         return f"[A, S, {last[self.modality.recording_rank]}]"
-
-    @property
-    def _pools_recordings(self) -> bool:
-        """Whether batches are drawn from all recordings alike: the flat VAE, but not of images,
-        whose batches are those of the HVAE (spec method 4)."""
-        return self.config.kind == "vae" and self.modality.image_shape is None
-
-    def _flat_batch_size(self, num_actions: int) -> int:
-        """Recordings in a flat-VAE batch: `A * floor(B * S / A)` (spec method 4)."""
-        total = self.config.actions_per_batch * self.config.recordings_per_action
-        return total // num_actions * num_actions
 
     def _init_variables(self, key: jax.Array, features: jax.Array) -> Any:
         noise = self._draw_noise(key, features)
@@ -256,8 +226,10 @@ class RepresentationLearner:
     def _update(
         self, state: RepresentationState, recordings: jax.Array
     ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step; metrics of this step."""
-        return self._descend(state, *self._draw(state, recordings))
+        """One gradient step on recordings of which it draws its batch."""
+        choice = self._choice(state, recordings.shape)
+        batch = recordings[choice.rows, choice.numbers]
+        return self._step_on(state, batch, recordings.shape[0])
 
     def _run_on_source(
         self, state: RepresentationState, source: RecordingSource, num_steps: int
@@ -284,21 +256,11 @@ class RepresentationLearner:
         return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
 
     def _step_on(
-        self, state: RepresentationState, batch: jax.Array, num_actions: jax.Array
+        self, state: RepresentationState, batch: jax.Array, num_actions: int | jax.Array
     ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step on a batch [B, S, T, D0] of `num_actions` train actions."""
-        epoch = self._epoch(state, num_actions)
-        return self._descend(state, self._features(batch), epoch, self._step_keys(state)[1])
-
-    def _descend(
-        self,
-        state: RepresentationState,
-        features: jax.Array,
-        epoch: jax.Array,
-        key_noise: jax.Array,
-    ) -> tuple[RepresentationState, Metrics]:
-        """One gradient step; its arguments are those that `_draw` returns."""
-        weight = reconstruction_weight(epoch)
+        """One gradient step, and its metrics, on a batch [B, S, T, D0] of `num_actions` actions."""
+        features, (_, key_noise) = self._features(batch), self._step_keys(state)
+        weight = reconstruction_weight(self._batches.epoch(state.step, num_actions))
         gradient_of = jax.value_and_grad(self._loss, has_aux=True)
         (loss, (terms, batch_stats)), grads = gradient_of(
             state.params, state.batch_stats, features, key_noise, weight
@@ -322,40 +284,15 @@ class RepresentationLearner:
         )
         return state, metrics
 
-    def _draw(
-        self, state: RepresentationState, recordings: jax.Array
-    ) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """This step's (features f32[B, S, T, D], epoch int32[], key of the latents' noise)."""
-        choice = self._choice(state, recordings.shape)
-        batch = recordings[choice.rows, choice.numbers]
-        epoch = self._epoch(state, recordings.shape[0])
-        return self._features(batch), epoch, self._step_keys(state)[1]
-
     def _step_keys(self, state: RepresentationState) -> tuple[jax.Array, jax.Array]:
         """Keys of this step: of its batch, and of the latents' noise."""
         key_batch, key_noise = jax.random.split(jax.random.fold_in(state.key_steps, state.step))
         return key_batch, key_noise
 
-    def _epoch(self, state: RepresentationState, num_actions: int | jax.Array) -> jax.Array:
-        """int32[] this step's epoch; of pooled recordings it is one step (spec method 4)."""
-        if self._pools_recordings:
-            return state.step
-        return state.step // (num_actions // self.config.actions_per_batch)
-
     def _choice(self, state: RepresentationState, shape: tuple[int, ...]) -> Choice:
         """Which recordings, of [A, S_total, ...], this step sees."""
         key_batch, _ = self._step_keys(state)
-        config = self.config
-        if self._pools_recordings:
-            return flat_vae_choice(key_batch, shape, self._flat_batch_size(shape[0]))
-        return hvae_choice(
-            state.key_epochs,
-            key_batch,
-            state.step,
-            shape,
-            config.actions_per_batch,
-            config.recordings_per_action,
-        )
+        return self._batches.choice(state.key_epochs, key_batch, state.step, shape)
 
     def _features(self, recordings: jax.Array) -> jax.Array:
         """f32[..., T, D] of stored recordings [..., T, D0] or of images.

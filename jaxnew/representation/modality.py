@@ -101,7 +101,7 @@ def vector_modality(name: str, feature_dim: int) -> Modality:
 
 
 def one_hot_modality(name: str, num_coordinates: int, num_categories: int) -> Modality:
-    """Stored integer coordinates [..., T, num_coordinates] as one-hot blocks (spec grid 5)."""
+    """Stored integer coordinates [..., T, num_coordinates] as one-hot blocks."""
 
     def featurize(recordings: jax.Array) -> jax.Array:
         blocks = jax.nn.one_hot(recordings, num_categories, dtype=jnp.float32)
@@ -113,7 +113,7 @@ def one_hot_modality(name: str, num_coordinates: int, num_categories: int) -> Mo
 def image_modality(
     name: str, image_shape: tuple[int, int, int], is_still: bool = False
 ) -> Modality:
-    """Stored uint8 images, scaled to +-0.5, with a Gaussian likelihood of pixels (spec method 3).
+    """Stored uint8 images, scaled to +-0.5, with a Gaussian likelihood of pixels.
 
     Args:
       name: see `Modality`.

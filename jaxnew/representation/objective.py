@@ -1,4 +1,7 @@
-"""Terms of the evidence lower bound (spec method 3.7). Pure functions."""
+"""Terms of the evidence lower bound. Pure functions.
+
+`docs/method.md`, "Objective of stage 1".
+"""
 
 from __future__ import annotations
 
@@ -8,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Spec method 3.7: bounds of the log-variance inside the Gaussian likelihood, and only there.
+# Bounds of the log-variance inside the Gaussian likelihood, and only there.
 LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -4.0, 3.0
 
 
@@ -57,7 +60,7 @@ def gaussian_log_likelihood(
 ) -> jax.Array:
     """Log-density of diagonal Gaussians, log(2 pi) included, summed over the last axis.
 
-    The log-variance is clamped to [-4, 3] here (spec method 3.7); outside, its gradient is zero.
+    The log-variance is clamped to [-4, 3] here; outside, its gradient is zero.
 
     Args:
       target: f32[..., D].
@@ -74,7 +77,7 @@ def gaussian_log_likelihood(
 def categorical_log_likelihood(
     target: jax.Array, logits: jax.Array, num_categories: int
 ) -> jax.Array:
-    """Log-probability of one-hot coordinates, summed over coordinates (spec method 3.7).
+    """Log-probability of one-hot coordinates, summed over coordinates.
 
     Args:
       target: f32[..., D] one-hot blocks of `num_categories`, one block per coordinate.
@@ -98,7 +101,7 @@ def gaussian_kl(
 
     Args:
       mean: f32[..., d].
-      log_variance: f32[d] or f32[..., d], not clamped (spec method 3.7).
+      log_variance: f32[d] or f32[..., d], not clamped.
       prior_mean: broadcasts against `mean`; zero by default.
       prior_log_variance: broadcasts against `mean`; zero by default.
     Returns:
@@ -139,17 +142,17 @@ def sample_gaussian(mean: jax.Array, log_variance: jax.Array, noise: jax.Array) 
 
 
 def reconstruction_weight(epoch: jax.Array) -> jax.Array:
-    """`w = 1 + 0.5^epoch`, f32[], of an int32[] epoch counted from 0 (spec method 3.7)."""
+    """`w = 1 + 0.5^epoch`, f32[], of an int32[] epoch counted from 0."""
     return 1.0 + jnp.exp2(-jnp.asarray(epoch, jnp.float32))
 
 
 def weighted_loss(terms: ElboTerms, weight: jax.Array | float) -> jax.Array:
-    """`-(w * reconstruction - KL / w)`, f32[] (spec method 3.7); w = 1 gives the negative ELBO."""
+    """`-(w * reconstruction - KL / w)`, f32[]; w = 1 gives the negative ELBO."""
     return (terms.kl_action + terms.kl_observation) / weight - weight * terms.reconstruction
 
 
 def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> ElboTerms:
-    """The terms of the bound for one batch (spec method 3.7).
+    """The terms of the bound for one batch.
 
     Args:
       output: of the model's forward pass on `features`.

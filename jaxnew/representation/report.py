@@ -1,4 +1,8 @@
-"""How good a table is before any policy is trained (spec method 3.8). NumPy only."""
+"""How good a table is before any policy is trained.
+
+`docs/method.md`, "Representation table and its report", has the numbers of the released tables.
+scikit-learn takes seconds to import, so it is imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +16,7 @@ ACTIVE_STD = 0.1
 
 
 def nearest_neighbours(vectors: np.ndarray, num_neighbours: int = NUM_NEIGHBOURS) -> np.ndarray:
-    """Rows of the nearest other rows, Euclidean; ties go to the lower row.
+    """Rows of the nearest other rows, Euclidean, by scikit-learn.
 
     Args:
       vectors: f[A, d], A > `num_neighbours`.
@@ -28,11 +32,12 @@ def nearest_neighbours(vectors: np.ndarray, num_neighbours: int = NUM_NEIGHBOURS
             f"{num_neighbours} nearest neighbours need more than {num_neighbours} actions; got "
             f"{len(vectors)}."
         )
-    vectors = vectors.astype(np.float64)
-    norms = np.square(vectors).sum(axis=1)
-    squared = norms[:, None] + norms - 2.0 * vectors @ vectors.T
-    np.fill_diagonal(squared, np.inf)
-    return np.argsort(squared, axis=1, kind="stable")[:, :num_neighbours]
+    from sklearn.neighbors import NearestNeighbors
+
+    # A tree chooses otherwise among equal distances, which tables of whole numbers have.
+    model = NearestNeighbors(n_neighbors=num_neighbours, algorithm="brute")
+    found: np.ndarray = model.fit(vectors.astype(np.float64)).kneighbors(return_distance=False)
+    return found
 
 
 def neighbour_purity(
@@ -41,13 +46,12 @@ def neighbour_purity(
     subset: Sequence[int] | np.ndarray | None = None,
     num_neighbours: int = NUM_NEIGHBOURS,
 ) -> float:
-    """Share of the nearest neighbours that have the label of their query (spec method 3.8).
+    """Share of the nearest neighbours that have the label of their query.
 
     Args:
       vectors: f[A, d].
       labels: int[A].
-      subset: rows that serve as queries and as candidates; None for all. The "test half" of the
-        spec is the held-out half: validation and test together.
+      subset: rows that serve as queries and as candidates; None for all.
       num_neighbours: k; a query is not its own neighbour.
 
     Raises:
@@ -60,7 +64,7 @@ def neighbour_purity(
 
 
 def linear_r2(vectors: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    """In-sample R2 of ordinary least squares with intercept, per target column (spec method 3.8).
+    """In-sample R2 of ordinary least squares with intercept, per target column.
 
     Args:
       vectors: f[A, d].
@@ -68,12 +72,14 @@ def linear_r2(vectors: np.ndarray, targets: np.ndarray) -> np.ndarray:
     Returns:
       f64[k]; NaN for a constant column, which has no variance to explain.
     """
-    design = np.concatenate([vectors, np.ones((len(vectors), 1))], axis=1).astype(np.float64)
+    from sklearn.linear_model import LinearRegression
+    from sklearn.metrics import r2_score
+
+    vectors = np.asarray(vectors, np.float64)
     targets = np.asarray(targets, np.float64).reshape(len(vectors), -1)
-    solution = np.linalg.lstsq(design, targets, rcond=None)[0]
-    residual = np.square(targets - design @ solution).sum(axis=0)
-    total = np.square(targets - targets.mean(axis=0)).sum(axis=0)
-    return np.where(total > 0, 1.0 - residual / np.where(total > 0, total, 1.0), np.nan)
+    predicted = LinearRegression().fit(vectors, targets).predict(vectors)
+    r2 = r2_score(targets, predicted, multioutput="raw_values")
+    return np.where(np.ptp(targets, axis=0) > 0, r2, np.nan)
 
 
 def entry_statistics(vectors: np.ndarray) -> dict[str, float]:
@@ -94,12 +100,12 @@ def describe(
     held_out: Sequence[int] | np.ndarray,
     targets: Mapping[str, np.ndarray] | None = None,
 ) -> dict[str, Any]:
-    """The numbers of spec method 3.8 for one table, as plain JSON.
+    """All numbers of one table, as plain JSON.
 
     Args:
       vectors: f32[A, d].
       labels: int[A].
-      held_out: rows outside the train split, for the second purity.
+      held_out: rows outside the train split, for the second purity: validation and test together.
       targets: by name f[A, ...], what a linear map of the representation should explain.
     """
     explained = {name: linear_r2(vectors, values) for name, values in (targets or {}).items()}
@@ -113,21 +119,16 @@ def describe(
 
 
 def tsne(vectors: np.ndarray, seed: int) -> np.ndarray:
-    """Two dimensions for a scatter plot: scikit-learn's t-SNE, perplexity 10 (spec method 11).
+    """Two dimensions for a scatter plot: scikit-learn's t-SNE, perplexity 10.
 
     Args:
       vectors: f[A, d], A > 10. The released figures draw at most 400 actions.
       seed: of scikit-learn's generator.
     Returns:
       f32[A, 2].
-
-    Raises:
-      ImportError: scikit-learn is missing.
     """
-    try:
-        from sklearn.manifold import TSNE
-    except ImportError as err:
-        raise ImportError("t-SNE plots need scikit-learn: pip install scikit-learn") from err
+    from sklearn.manifold import TSNE
+
     return TSNE(n_components=2, perplexity=10, random_state=seed).fit_transform(vectors)
 
 

@@ -47,9 +47,11 @@ class StoredRecordings:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """As in `RecordingSource`."""
         return len(self._rows), *self._data.shape[1:]
 
     def gather(self, rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:
+        """As in `RecordingSource`."""
         return np.asarray(self._data[self._rows[rows], numbers])
 
 
@@ -83,6 +85,7 @@ class DrawnRecordings:
 
     @property
     def shape(self) -> tuple[int, ...]:
+        """As in `RecordingSource`."""
         return *self._stored.shape[:2], *self._drawn_shape
 
     def gather(self, rows: np.ndarray, numbers: np.ndarray) -> np.ndarray:

@@ -1,28 +1,36 @@
-"""The flat VAE baseline: every recording on its own, no action latent (spec method 4)."""
+"""The flat VAE baseline: every recording on its own, no action latent.
+
+`docs/method.md`, "Flat VAE".
+"""
 
 from __future__ import annotations
+
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
+from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.decoders import DecoderStart
 from jaxnew.representation.encoders import (
     Dense,
     LatentHead,
     likelihood_log_variance,
 )
+from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.images import (
     decoded,
     encoded,
     recording_decoder,
     recording_encoder,
 )
+from jaxnew.representation.modality import Modality
 from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
 
 
 class FlatInference(nn.Module):
-    """`q(z | o)` of the flat VAE (spec method 4).
+    """`q(z | o)` of the flat VAE.
 
     Attributes:
       width: H.
@@ -42,8 +50,7 @@ class FlatInference(nn.Module):
 class FlatVAE(nn.Module):
     """The flat VAE: encoder, `q(z | o)`, decoder, prior N(0, I).
 
-    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation
-    (spec method 4).
+    For trajectories, videos and still images. Dense layers keep PyTorch's default initialisation.
 
     Attributes:
       encoder_width: E.
@@ -94,7 +101,7 @@ class FlatVAE(nn.Module):
         )
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """An action's representation, with running averages (spec method 4).
+        """An action's representation, with running averages.
 
         Args:
           features: f32[B, S, T, D].
@@ -105,3 +112,20 @@ class FlatVAE(nn.Module):
         mean, log_variance = self.inference(encoded(self.encoder, features, False)[0], False)
         mean = jnp.mean(mean, axis=-1).T
         return mean, jnp.broadcast_to(log_variance, mean.shape)
+
+
+def build_model(config: RepresentationConfig, modality: Modality) -> HVAE | FlatVAE:
+    """The network for a modality's features: what `config.kind` names, with the config's widths."""
+    shared: dict[str, Any] = {
+        "encoder_width": config.encoder_width,
+        "hidden_width": config.hidden_width,
+        "observation_latent": config.observation_latent,
+        "gaussian_dim": modality.gaussian_dim,
+        "image_shape": modality.image_shape,
+        "is_still": modality.is_still,
+    }
+    if config.kind == "vae":
+        return FlatVAE(**shared)
+    return HVAE(
+        inference_width=config.inference_width, action_latent=config.action_latent, **shared
+    )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -202,7 +202,8 @@ class DeviceRollout:
         )
         batch = RolloutBatch(
             observation=state.observation,
-            available=None if actions.is_fixed else state.available,
+            # A fixed set is put in once, by `collect`.
+            available=cast(AvailableSet, None if actions.is_fixed else state.available),
             sample=sample,
             log_prob=distribution.log_prob(sample),
             value=value,
@@ -256,7 +257,7 @@ class DeviceRollout:
     def _scale_reward(
         self, reward: jax.Array, state: RolloutState, done: jax.Array, discount: jax.Array | float
     ) -> tuple[jax.Array, jax.Array, RunningStatistics]:
-        """Spec method 5.1: rewards over the running deviation of the discounted return."""
+        """Rewards over the running deviation of the discounted return."""
         discounted_return = discount * state.discounted_return + reward
         statistics = state.return_statistics
         if self.config.normalize_rewards:

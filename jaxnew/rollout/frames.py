@@ -1,4 +1,4 @@
-"""Stacks of the last frames, of which every frame is stored once (spec method 5.1).
+"""Stacks of the last frames, of which every frame is stored once.
 
 A stack of k frames holds the newest last; of an episode that is younger than k frames the older
 ones are zeros. 12,288 transitions with stacks of three 84x84 frames are 260 MB as stacks and 87 MB

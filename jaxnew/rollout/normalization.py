@@ -1,4 +1,4 @@
-"""Running statistics of observations and of returns (spec method 5.1, vector-state domains)."""
+"""Running statistics of observations and of returns (docs/method.md, "Normalisation")."""
 
 from __future__ import annotations
 

@@ -125,7 +125,7 @@ class StageTwoBudget:
 
 @dataclass(frozen=True)
 class Baselines:
-    """Where the paper's baselines differ from domain to domain (spec method 8).
+    """Where the paper's baselines differ from domain to domain.
 
     Attributes:
       continuous_rollout_share: steps per update of the continuous output over those of ours.
@@ -134,7 +134,7 @@ class Baselines:
         without subsampling.
       fixed_set_minibatches: minibatches per pass of the utility policy without subsampling; 0 for
         as many as with it.
-      finetune_share: updates of fine-tuning on new actions over those of training (spec method 9).
+      finetune_share: updates of fine-tuning on new actions over those of training.
     """
 
     continuous_rollout_share: float = 1.0

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.config import RepresentationConfig
@@ -136,7 +136,7 @@ _NOT_SET = {
 def train_config_type(task: Task) -> type[TrainConfig]:
     """`TrainConfig` with the types of a task's own settings."""
     pool = None if task.host is None else task.host.pool_settings
-    return _typed(type(task.environment), type(pool))
+    return _typed(cast(Hashable, type(task.environment)), cast(Hashable, type(pool)))
 
 
 @functools.cache

@@ -16,7 +16,7 @@ from jaxnew.collection import RecordBlock
 from jaxnew.cores import available_cores
 from jaxnew.environment import ActionSpec, Environment, ObservationSpec
 from jaxnew.observations import RecordingFormat
-from jaxnew.representation.learner import Modality
+from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawRecordings
 from jaxnew.rollout.pool import HostEnvironments, HostPool
 from jaxnew.task.budgets import Baselines, StageOneBudget, StageTwoBudget

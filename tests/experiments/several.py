@@ -106,22 +106,11 @@ def main(module: str, probe: str, jobs: list[list[str]]) -> list[str]:
     return [_output(command, job, around) for job in jobs]
 
 
-def _forget_flags() -> None:
-    from absl import flags
-
-    for name in flags.FLAGS:
-        flags.FLAGS[name].unparse()
-
-
 def _read_by_user(command: Any, job: list[str]) -> str:
-    from experiments.pipeline.flags import run_command
-
-    _forget_flags()
-    sys.argv = [command.__name__, *job]
     text = io.StringIO()
     with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
         try:
-            run_command(command.main)
+            command.ARGUMENTS.start(command.main, job)
         except SystemExit as end:
             # As the interpreter does it: a text is printed, and is an error.
             if isinstance(end.code, str):
@@ -133,12 +122,9 @@ def _read_by_user(command: Any, job: list[str]) -> str:
 
 
 def _output(command: Any, job: list[str], around: Any) -> str:
-    from absl import flags
+    from experiments.flags import configure_jax
 
-    from experiments.pipeline.flags import configure_jax
-
-    _forget_flags()
-    flags.FLAGS(["command", *job])
+    command.ARGUMENTS.parse(job)
     configure_jax()
     text = io.StringIO()
     with contextlib.redirect_stdout(text):

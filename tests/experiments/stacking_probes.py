@@ -16,22 +16,22 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 from unittest import mock
 
-import jax
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from experiments.pipeline import training
-from experiments.pipeline.machinery import machinery_of
-from jaxnew.evaluation import Evaluator
+from jaxnew import trainer
+from jaxnew.ppo import Learner
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.trainer import rollout_of
 
 EPISODES = 4
 
 _settle = MujocoC.settle_host
 _placed: set[int] = set()
 _batches: set[tuple[int, ...]] = set()
-_machinery: dict[Any, Any] = {}
-_plays: dict[Any, Any] = {}
+_rollouts: dict[Any, Any] = {}
+_learners: dict[Any, Any] = {}
 
 
 class Seen(NamedTuple):
@@ -54,8 +54,8 @@ def watched(job: list[str]) -> Iterator[None]:
     _batches.clear()
     with (
         mock.patch.object(MujocoC, "settle_host", _noting),
-        mock.patch.object(Evaluator, "_play_sampled", property(_play)),
-        mock.patch.object(training, "machinery_of", _shared),
+        mock.patch.object(trainer, "rollout_of", _shared),
+        mock.patch.object(trainer, "Learner", _shared_learner),
     ):
         yield
     found = {"placed": sorted(_placed), "batches": sorted(_batches)}
@@ -84,22 +84,18 @@ def _noting(engine: MujocoC, shape_ids: Any, qpos: Any, qvel: Any) -> Any:
     return _settle(engine, shape_ids, qpos, qvel)
 
 
-def _shared(task: Any, method: Any, config: Any, *others: Any) -> Any:
-    """`machinery_of`, which gives the same to jobs that differ in numbers only."""
+def _shared(task: Any, method: Any, config: Any, *others: Any) -> DeviceRollout:
+    """`rollout_of`, which gives the same to jobs that differ in numbers only."""
     task = replace(task, evaluation_width=EPISODES)
     if method.name != "ours":
-        return machinery_of(task, method, config, *others)
+        return rollout_of(task, method, config, *others)
     key = (task.name, method._is_conditioned, config)
-    if key not in _machinery:
-        _machinery[key] = machinery_of(task, method, config, *others)
-    return _machinery[key]
+    if key not in _rollouts:
+        _rollouts[key] = rollout_of(task, method, config, *others)
+    return _rollouts[key]
 
 
-def _play(evaluator: Evaluator) -> Any:
-    """`Evaluator._play_sampled`, one for all that are alike."""
-    sizes = (evaluator.set_size, evaluator.padded_set_size, evaluator.first_size, evaluator.growth)
-    # The objects are kept, so that their ids stay theirs.
-    key = (id(evaluator.env), id(evaluator.method), evaluator.width, sizes)
-    if key not in _plays:
-        _plays[key] = (evaluator, jax.jit(evaluator.play_block))
-    return _plays[key][1]
+def _shared_learner(rollout: DeviceRollout, config: Any) -> Learner:
+    """`Learner`, one for each rollout and config, with its compiled programs."""
+    # The rollouts are kept, so that their ids stay theirs.
+    return _learners.setdefault((id(rollout), config), Learner(rollout, config))

@@ -9,12 +9,12 @@ from functools import partial
 import jax
 import numpy as np
 
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.flags import load_task
-from experiments.pipeline.training import TrainConfig, Trainer
-from experiments.sweep import Sweep, member_configs
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import engineered_table
+from jaxnew.sweeping import SweepProgram, member_configs
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.trainer import Trainer
+from jaxnew.training import train_config
 
 
 def distance(tree: object, other: object) -> float:
@@ -34,28 +34,26 @@ def opinionated(state: TrainState) -> TrainState:
 
 
 def main() -> None:
-    domain = Domain.of(load_task("grid_world"), None)
+    domain = Domain.of(load_task("grid_world"))
     table = engineered_table(domain.universe, "gt12")
     budget = domain.task.stage_two["smoke"]
-    base = TrainConfig.of(domain, "ours", "gt12", table, budget, 31)
-    configs = member_configs(base, list(range(8)), ["entropy_coefficient=0.0,0.1"])
+    base = train_config(domain, "ours", "gt12", table, budget, 31)
+    configs = member_configs(base, list(range(8)), {"entropy_coefficient": (0.0, 0.1)})
     trainer = Trainer.of(configs[0], domain.task, domain.split, table)
     # As `Trainer` does it; one compilation serves all, for seeds and hyper-parameters are traced.
     init = jax.jit(trainer.learner.init)
     update = jax.jit(partial(trainer.learner.updates, num_updates=1))
-    pool = trainer.pools["train"]
     singles = [
         update(
-            opinionated(init(jax.random.key(config.seed), trainer.table, pool)),
+            opinionated(init(jax.random.key(config.seed), trainer.training)),
             config.hyperparameters,
-            trainer.table,
-            pool,
+            trainer.training,
         )
         for config in configs
     ]
     errors: dict[int, list[float]] = {1: [], 2: []}
     for members_at_once in errors:
-        sweep = Sweep.of(trainer, configs, jax.devices(), members_at_once)
+        sweep = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
         started = sweep.init()
         started = replace(started, members=opinionated(started.members))
         state, metrics = sweep.chunk(started, 1)
@@ -71,7 +69,9 @@ def main() -> None:
                 metrics[f"{index:03d}/{name}"], float(single_metrics[name]), rtol=1e-5
             )
     leaf = jax.tree.leaves(state.members.params)[0]
-    seven = Sweep.of(trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6])
+    seven = SweepProgram.of(
+        trainer, [replace(base, seed=seed) for seed in range(7)], jax.devices()[:6]
+    )
     print(
         json.dumps(
             {

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-
 from experiments.pipeline.artifacts import load_encoder
 from experiments.pipeline.flags import UsageError
 from experiments.pipeline.training import load_trainer
+
 from experiments.reports.plots import Metric
 from experiments.reports.searches import batch_size_sources
 from experiments.reports.studies import STUDIES, encoded_test_actions

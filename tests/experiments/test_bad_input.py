@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import skill_universe
-from experiments.pipeline.artifacts import Domain, find_table
-from experiments.pipeline.flags import load_task
 from jaxnew import collection
 from jaxnew.actions import SplitMismatch
+from jaxnew.embedding import find_table
+from jaxnew.observations import ObservationsError
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.task.domain import Domain, load_task
 from tests.experiments.commands import run
 from tests.experiments.several import refused
 
@@ -42,7 +43,16 @@ WRONG = {
     "--set=ppo.num_epoch=2": ["ppo.num_epoch", "ppo.num_epochs"],
     "--set=ppo.num_epochs=two": ["ppo.num_epochs", "int", "two"],
     "--set=ppo.num_minibatches=7": ["256", "num_minibatches=7"],
-    "--set=ppo.rollout.set_size=300": ["300", "validation", "256"],
+    "--set=sets.size=300": ["300", "validation", "256"],
+    "--set=hyperparameters.learning_rate=-1": ["learning_rate=-1", "[0, 1]"],
+    "--set=hyperparameters.discount=2": ["discount=2", "[0, 1]"],
+    "--set=hyperparameters.clip=-1": ["clip=-1", "at least 0"],
+    "--set=environment.max_moves=0": ["max_moves=0", "1"],
+    "--set=table_hash=0": ["table_hash cannot be set"],
+    "--set=split=full": ["split cannot be set", "--split"],
+    "--seed=4294967296": ["4294967296", "4294967295"],
+    "--seed=-1": ["seed=-1", "0..4294967295"],
+    "--split_seed=4294967296": ["4294967296", "4294967295"],
     "train": ["train", "--flag=value"],
 }
 
@@ -166,7 +176,7 @@ def test_bad_id_files(policy_run: Path, tmp_path: Path) -> None:
 
 def test_a_nan_stops_the_run_and_keeps_what_was_saved(runs: Path, tmp_path: Path) -> None:
     flags = ["--budget=smoke", "--representation=gt12", f"--workdir={tmp_path / 'nan'}"]
-    job = (*flags, "--set=hyperparameters.learning_rate=1e38")
+    job = (*flags, "--set=hyperparameters.entropy_coefficient=1e38")
     output, again = refused("train", [job, job])
     assert "NonFiniteError" in output
     assert "step" in output
@@ -179,7 +189,7 @@ def test_damaged_recordings_are_found(tmp_path: Path) -> None:
     content = bytearray(file.read_bytes())
     content[-5] ^= 0xFF
     file.write_bytes(content)
-    with pytest.raises(observations.ObservationsError, match="1023"):
+    with pytest.raises(ObservationsError, match="1023"):
         collection.load(file.parent, skill_universe())
     output = run("collect", "--budget=smoke", f"--runs={tmp_path}")
     assert "1024 actions x 16 recordings" in output

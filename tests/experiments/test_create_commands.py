@@ -234,7 +234,7 @@ def test_a_run_is_evaluated_on_test_tools(runs: Path, evaluated: str, name: str)
     assert 1.0 <= mean["num_steps"] == mean["episode_length"] <= longest
     counted = mean["num_placed"] + mean["num_blocked"] + mean["num_no_op"]
     assert counted == pytest.approx(mean["num_steps"], abs=1e-5)
-    # Spec create 6.1: 0.01 for each action that is not blocked, subgoals, the target's hit; up to
+    # docs/create.md, "Rewards": 0.01 for each action not blocked, subgoals, the target's hit; up to
     # 10 for the goal.
     certain = 0.01 * (mean["num_steps"] - mean["num_blocked"]) + mean["subgoal_reward"]
     certain += HIT_REWARD.get(RUNS[name].task, 1.0) * mean["target_hit"]
@@ -253,7 +253,7 @@ def test_what_methods_are_made_of(runs: Path, trained_all: dict[str, str]) -> No
     num_train = len(published_split().train) + 1
     entropy = {name: config[name]["hyperparameters"]["entropy_coefficient"] for name in RUNS}
     assert {name for name, value in entropy.items() if value == 0.0} == {"belt"}
-    fixed = {name for name in RUNS if config[name]["ppo"]["rollout"]["has_fixed_set"]}
+    fixed = {name for name in RUNS if config[name]["sets"]["is_fixed"]}
     assert fixed == {"moving", "basket"}
     assert size["basket"] == size["push"], "the utility takes any number of tools"
     assert size["buckets"] == size["push"], "a random policy has heads for positions all the same"
@@ -263,7 +263,7 @@ def test_what_methods_are_made_of(runs: Path, trained_all: dict[str, str]) -> No
     assert size["collide"]["policy.mean.kernel"] == (64, WIDTH)
     assert not [key for key in size["collide"] if key.startswith("utility")]
     assert size["push"]["auxiliary.heads.alpha.kernel"] == (64, 2)
-    assert size["conditioned"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
+    assert size["conditioned"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a]"
 
 
 @pytest.mark.slow
@@ -310,7 +310,7 @@ KINDS = [(method, start) for method in SOURCES for start in ("warm", "scratch")]
 def test_finetuning_of_each_kind(
     runs: Path, trained_few: dict[str, str], tmp_path: Path, kinds: list[tuple[str, str]]
 ) -> None:
-    """Both policies, warm and from scratch, with all test tools as one set (spec method 9)."""
+    """Both policies, warm and from scratch, with all test tools as one set."""
     assert trained_few
     jobs = []
     for method, start in kinds:

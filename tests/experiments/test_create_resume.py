@@ -121,10 +121,10 @@ def test_a_command_ends_with_the_error_of_the_worker_and_what_to_do() -> None:
     code = (
         "from envs_host._process import Lost\n"
         "from envs_host.pool import WorkerError\n"
-        "from experiments.pipeline import flags\n"
+        "from experiments.flags import Arguments\n"
         "def main():\n"
         "    raise WorkerError(1, [2], ((31, (2, 5)),), Lost('was killed by SIGKILL'))\n"
-        "flags.run_command(main)\n"
+        "Arguments('').start(main)\n"
     )
     done = subprocess.run(
         [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=False

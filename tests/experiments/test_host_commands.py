@@ -13,11 +13,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.pipeline.training import load_state, load_trainer
+from jaxnew.run import Run
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from jaxnew.task import Task
+from jaxnew.task.task import Task
 from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
+from tests.experiments.create_runs import saved, timeless
 from tests.toy_task import TASK
 
 pytestmark = pytest.mark.integration
@@ -53,12 +54,10 @@ def test_finetune_with_the_test_actions(trained: Path, tmp_path: Path) -> None:
     run("finetune", f"--run={trained}", *flags)
     config = read_json(tmp_path / "warm" / "config.json")
     assert (config["trained_on"], config["method"]) == ("test", "no-subsampling")
-    _, source, _ = load_trainer(trained)
-    start = load_state(load_trainer(trained)[0], source, "best")[0].params
-    loaded, trainer, _ = load_trainer(tmp_path / "warm")
-    end = load_state(loaded, trainer, "latest")[0].params
-    fresh = trainer.init().params
-    trainer.close()
+    start = Run.load(trained).policy.params
+    with Run.load(tmp_path / "warm", "latest") as warm:
+        end = warm.policy.params
+        fresh = warm.trainer.init().params
 
     def distance(params: Any) -> float:
         return float(
@@ -94,27 +93,14 @@ def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) ->
     assert "resuming" in run("train", *COMMON, f"--workdir={killed}")
     for kind in ("best", "latest"):
         assert saved(killed, kind) == saved(trained, kind)
+        assert any("environments" in leaf for leaf in saved(trained, kind))
     assert timeless(killed) == timeless(trained)
-
-
-def saved(path: Path, kind: str) -> Any:
-    """Hashes of all that a checkpoint holds."""
-    checkpointer = Checkpointer(path / "checkpoints")
-    step = checkpointer.steps(kind)[-1]
-    record = checkpointer._read_record(checkpointer._path(kind, step))
-    assert any("environments" in leaf["path"] for leaf in record["leaves"])
-    return step, [(leaf["path"], leaf["sha256"]) for leaf in record["leaves"]]
-
-
-def timeless(path: Path) -> list[dict[str, Any]]:
-    lines = metrics.read(path)
-    return [{k: v for k, v in line.items() if not k.startswith("time/")} for line in lines]
 
 
 def test_sweep_says_what_to_do(tmp_path: Path) -> None:
     output = run("sweep", *COMMON, f"--runs={tmp_path}", fails=True)
     assert "toy run on the host" in output
-    assert "python -m experiments.train` once per --seed" in output
+    assert "Run `train` once per seed" in output
     assert not list(tmp_path.iterdir())
 
 
@@ -122,5 +108,5 @@ def test_sweep_says_what_to_do(tmp_path: Path) -> None:
 def test_a_task_has_one_kind_of_environment() -> None:
     with pytest.raises(ValueError, match="Task none needs one of make_environment and host"):
         Task(name="none", make_universe=TASK.make_universe, splits=TASK.splits, stage_two={})
-    with pytest.raises(ValueError, match="environments of this task run on the host"):
-        TASK.make_environment()
+    with pytest.raises(ValueError, match="environments of task toy run on the host"):
+        TASK.environment_of()

@@ -7,10 +7,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.flags import UsageError, load_task
-from experiments.pipeline.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.storage import metrics
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
+from jaxnew.task.places import UsageError
 from tests.experiments.commands import OPTIMIZED, read_json, run
 from tests.experiments.several import run_several
 
@@ -100,7 +100,7 @@ def test_a_policy_goes_on_with_new_actions(runs: Path) -> None:
 
 @pytest.mark.unit
 def test_what_each_method_changes() -> None:
-    """Spec method 8, on the paper's budgets."""
+    """docs/method.md, "Baselines and ablations", on the paper's budgets."""
     for name in TASKS:
         domain = Domain.of(load_task(name), None)
         paper = domain.task.stage_two["paper"]
@@ -109,7 +109,7 @@ def test_what_each_method_changes() -> None:
         assert found["no-entropy"].hyperparameters.entropy_coefficient == 0.0
         assert paper.hyperparameters.entropy_coefficient > 0.0
         for fixed in ("no-subsampling", "nearest-neighbour"):
-            assert found[fixed].ppo.rollout.has_fixed_set
+            assert found[fixed].sets.is_fixed
             assert found[fixed].num_updates == paper.num_updates
         steps = {m: b.num_updates * b.ppo.steps_per_update for m, b in found.items()}
         assert all(abs(s - steps["ours"]) <= paper.ppo.steps_per_update for s in steps.values())
@@ -119,7 +119,7 @@ def test_what_each_method_changes() -> None:
 
 @pytest.mark.unit
 def test_sizes_of_the_published_methods() -> None:
-    """Spec method 6 and 8: rollout lengths, minibatches and fixed sets."""
+    """docs/method.md, "PPO": rollout lengths, minibatches and fixed sets."""
     grid, reco = (Domain.of(load_task(name), None) for name in TASKS)
     continuous = [
         adapted(d.task.stage_two["paper"], "continuous", d.task, d.split).ppo for d in (grid, reco)

@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.flags import UsageError, load_task
-from experiments.pipeline.methods import adapted, file_name, method_of, variant_of
 from experiments.reports.jobs import embed_job, sweep_job
 from experiments.reports.production import Cell, Source
 from jaxnew.policy import UtilityMethod
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.methods import adapted, file_name, method_of, variant_of
+from jaxnew.task.places import UsageError
 
 pytestmark = pytest.mark.unit
 
@@ -139,7 +139,7 @@ def test_what_is_no_policy() -> None:
 
 
 def test_what_is_no_task() -> None:
-    with pytest.raises(UsageError, match=r"someones_module:NUMBER is 3, not a jaxnew.task.Task"):
+    with pytest.raises(UsageError, match=r"someones_module:NUMBER is 3, not a jaxnew.Task"):
         load_task("someones_module:NUMBER")
 
 

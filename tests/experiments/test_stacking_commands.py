@@ -14,9 +14,9 @@ import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
 from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
-from experiments.pipeline.artifacts import REPRESENTATION_SEED
-from experiments.pipeline.training import load_trainer
+from jaxnew.embedding import REPRESENTATION_SEED
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.run import Run
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
 from tests.experiments import stacking_runs as stacking
@@ -241,7 +241,7 @@ def test_what_methods_are_made_of(
     entropy = {name: config[name]["hyperparameters"]["entropy_coefficient"] for name in RUNS}
     assert {name for name, value in entropy.items() if value == 0.0} == {"no-entropy"}
     assert {value for value in entropy.values() if value} == {0.01}
-    fixed = {name for name in RUNS if config[name]["ppo"]["rollout"]["has_fixed_set"]}
+    fixed = {name for name in RUNS if config[name]["sets"]["is_fixed"]}
     assert fixed == set(FIXED_SETS)
     assert config["clusters"]["num_clusters"] == 10
     assert all(name == "clusters" or not config[name]["num_clusters"] for name in RUNS)
@@ -257,7 +257,7 @@ def test_what_methods_are_made_of(
         "random",
         "2d-place",
     }
-    assert size["2d-place"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a] (spec method 5.5)"
+    assert size["2d-place"]["auxiliary.alpha.kernel"] == (128, 64), "[f(s), a]"
     assert size["2d-place"]["auxiliary.alpha.out.kernel"] == (64, 2)
     assert {shapes["auxiliary.heads.stop.kernel"] for shapes in size.values()} == {(64, 2)}
 
@@ -265,10 +265,10 @@ def test_what_methods_are_made_of(
 @pytest.mark.slow
 def test_clusters_are_of_train_shapes(runs: Path, trained_others: dict[str, str]) -> None:
     assert trained_others
-    _, trainer, split = load_trainer(runs / "clusters")
-    assert np.asarray(trainer.training_pool.group_starts).shape == (11,), "ten clusters"
-    ids = np.asarray(trainer.training_pool.ids)[: int(trainer.training_pool.size)]
-    np.testing.assert_array_equal(np.sort(ids), split.train)
+    run = Run.load(runs / "clusters")
+    pool = run.trainer.training.pool
+    assert np.asarray(pool.group_starts).shape == (11,), "ten clusters"
+    np.testing.assert_array_equal(np.sort(pool.ids[: int(pool.size)]), run.split.train)
 
 
 @pytest.mark.slow
@@ -299,7 +299,7 @@ def test_representations_are_those_that_were_asked_for(
 def test_finetuning_of_each_kind(
     runs: Path, trained_alike: dict[str, str], trained_others: dict[str, str], tmp_path: Path
 ) -> None:
-    """Both policies, warm and from scratch, with all test shapes as one set (spec method 9)."""
+    """Both policies, warm and from scratch, with all test shapes as one set."""
     assert trained_alike
     assert trained_others
     sources = {"ours": "line", "nearest-neighbour": "no-place"}

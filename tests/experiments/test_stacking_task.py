@@ -1,10 +1,10 @@
-"""Shape Stacking's presets against the columns of spec method 3, 6, 7 and 8."""
+"""Shape Stacking's presets against the paper's numbers."""
 
 from __future__ import annotations
 
 import pytest
 
-from experiments.pipeline.flags import load_task
+from jaxnew.task.domain import load_task
 
 TASK = load_task("shape_stacking")
 
@@ -14,7 +14,7 @@ def test_the_papers_encoder() -> None:
     budget = TASK.stage_one["paper"]
     assert (budget.num_recordings, budget.counts_epochs) == (1024, True)
     for kind in ("hvae", "vae"):
-        config = budget.configs[kind]
+        config = getattr(budget, kind)
         assert (config.actions_per_batch, config.recordings_per_action) == (32, 52)
         assert (config.action_latent, config.observation_latent) == (128, 128)
         widths = config.encoder_width, config.inference_width, config.hidden_width
@@ -24,7 +24,7 @@ def test_the_papers_encoder() -> None:
         assert budget.config(kind, 420, 405).num_steps == 65_000
         assert budget.config(kind, 810, 405).num_steps == 125_000
     laptop = TASK.stage_one["laptop"]
-    assert laptop.config("hvae", 810, 405) == laptop.configs["hvae"]
+    assert laptop.config("hvae", 810, 405) == laptop.hvae
 
 
 @pytest.mark.golden
@@ -32,7 +32,7 @@ def test_the_papers_policy() -> None:
     budget = TASK.stage_two["paper"]
     ppo, numbers = budget.ppo, budget.hyperparameters
     rollout = ppo.rollout
-    assert (rollout.num_envs, rollout.num_steps, rollout.set_size) == (32, 128, 20)
+    assert (rollout.num_envs, rollout.num_steps, budget.sets.size) == (32, 128, 20)
     assert not rollout.normalize_observations
     assert not rollout.normalize_rewards
     assert (ppo.num_epochs, ppo.num_minibatches) == (4, 4)
@@ -40,6 +40,6 @@ def test_the_papers_policy() -> None:
     assert (numbers.entropy_coefficient, numbers.clip) == (0.01, 0.1)
     assert (numbers.discount, numbers.gae_lambda) == (0.99, 0.95)
     assert ppo.lr_steps == 100_000_000
-    # Five evaluations of 8 processes (method 7).
+    # Five evaluations of 8 processes.
     loop = budget.loop
     assert (loop.evaluate_every, loop.evaluation_episodes) == (25, 40)

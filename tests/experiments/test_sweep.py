@@ -9,11 +9,13 @@ import sys
 
 import pytest
 
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.flags import UsageError, load_task
-from experiments.pipeline.training import TrainConfig
-from experiments.sweep import member_configs, parse_seeds
+from experiments.sweep import numbers, varied
 from jaxnew.representation.table import engineered_table
+from jaxnew.sweeping import checked_seeds, member_configs
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import TrainConfig
+from jaxnew.training import train_config
 from tests.experiments.commands import OPTIMIZED, ROOT
 
 
@@ -21,7 +23,7 @@ from tests.experiments.commands import OPTIMIZED, ROOT
 def base() -> TrainConfig:
     domain = Domain.of(load_task("grid_world"), None)
     table = engineered_table(domain.universe, "gt12")
-    return TrainConfig.of(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
+    return train_config(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
 
 
 @pytest.mark.integration
@@ -51,7 +53,7 @@ def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
 
 @pytest.mark.unit
 def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
-    vary = ["entropy_coefficient=0.0,0.1", "clip=0.1,0.2,0.3"]
+    vary = {"entropy_coefficient": [0.0, 0.1], "clip": [0.1, 0.2, 0.3]}
     members = member_configs(base, [1, 2], vary)
     found = {
         (m.seed, m.hyperparameters.entropy_coefficient, m.hyperparameters.clip) for m in members
@@ -64,15 +66,29 @@ def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
 @pytest.mark.unit
 @pytest.mark.parametrize(
     ("vary", "says"),
-    [("entropy=0.1", "entropy_coefficient"), ("clip=a", "name=value"), ("clip", "name=value")],
+    [
+        ({"entropy": [0.1]}, "entropy_coefficient"),
+        ({"clip": []}, "at least one value"),
+        ({"learning_rate": [-1.0]}, "learning_rate"),
+    ],
 )
-def test_bad_axes_are_refused(base: TrainConfig, vary: str, says: str) -> None:
-    with pytest.raises(UsageError, match=says):
-        member_configs(base, [1], [vary])
+def test_bad_axes_are_refused(base: TrainConfig, vary: dict[str, list[float]], says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        member_configs(base, [1], vary)
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("seeds", [["1", "x"], ["1", "1"], []])
-def test_bad_seeds_are_refused(seeds: list[str]) -> None:
+@pytest.mark.parametrize("entry", ["clip=a", "clip", "clip=0.1,,0.2"])
+def test_axes_that_are_no_numbers_are_refused(entry: str) -> None:
+    with pytest.raises(UsageError, match=r"--vary=clip.*name=value"):
+        varied(entry)
+    assert varied("clip=0.1,2") == ("clip", [0.1, 2.0])
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("seeds", [[1, 1], []])
+def test_bad_seeds_are_refused(seeds: list[int]) -> None:
     with pytest.raises(UsageError, match="seeds"):
-        parse_seeds(seeds)
+        checked_seeds(seeds)
+    with pytest.raises(UsageError, match="--seeds"):
+        numbers(int, ["1", "x"], "--seeds")

@@ -12,19 +12,14 @@ import pytest
 
 from envs_host.create.play import PlayConfig, record_images
 from envs_host.create.recorder import Recorder
-from experiments.pipeline.artifacts import (
-    REPRESENTATION_SEED,
-    Domain,
-    parse_representation,
-    train_representation,
-)
-from experiments.pipeline.flags import UsageError, load_task
-from experiments.pipeline.recordings import collect
+from jaxnew.embedding import REPRESENTATION_SEED, collect, embed, parse_representation
 from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.representation.sources import DrawnRecordings, StoredRecordings
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError
 from tests import video_task
 from tests.experiments.commands import read_json, run
 
@@ -82,7 +77,7 @@ def test_both_ways_and_a_resumed_run_give_the_same_bits(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stores_drawn: bool
 ) -> None:
     """Killed while the batch of a later step is gathered, then run again, perhaps the other way."""
-    domain = Domain.of(replace(video_task.TASK, place=PLACE.partition("=")[2]), None)
+    domain = Domain.of(replace(video_task.TASK, place=PLACE.partition("=")[2]))
     shutil.copytree(runs / TOY / "poses-3", tmp_path / TOY / "poses-3")
     kind = StoredRecordings if stores_drawn else DrawnRecordings
     gather, calls = kind.gather, []
@@ -94,8 +89,9 @@ def test_both_ways_and_a_resumed_run_give_the_same_bits(
         return gather(self, rows, numbers)
 
     def train(stores: bool) -> Path:
-        found = train_representation(domain, tmp_path, "hvae-video", "smoke", stores_drawn=stores)
-        return found.path
+        return embed(
+            domain.task, "hvae-video", budget="smoke", stores_drawn=stores, runs=tmp_path
+        ).path
 
     with monkeypatch.context() as patch:
         patch.setattr(kind, "gather", dying)
@@ -139,9 +135,9 @@ def simulated(num_recordings: int) -> np.ndarray:
 
 @pytest.mark.unit
 def test_recordings_of_both_kinds_are_those_of_the_simulations(tmp_path: Path) -> None:
-    domain = Domain.of(video_task.TASK, None)
+    domain = Domain.of(video_task.TASK)
     made = {
-        stores: collect(tmp_path, video_task.VIDEO, domain.universe, 2, 9, stores)
+        stores: collect(domain, tmp_path, 2, video_task.VIDEO, stores, seed=9)
         for stores in (False, True)
     }
     expected = record_images(9, video_task.TOOL_OF, 2)[:, :, SEEN, ..., None]
@@ -156,9 +152,9 @@ def test_recordings_of_both_kinds_are_those_of_the_simulations(tmp_path: Path) -
         np.testing.assert_array_equal(first.gather(np.array([2]), np.array([0])), expected[[11], 0])
         whole: Any = recordings.for_encoding()
         assert whole.shape == expected.shape
-    assert made[True].hash == made[False].hash
+    assert made[True].recorded.hash == made[False].recorded.hash
     assert made[False].drawn is None
-    states = collect(tmp_path, video_task.STATES, domain.universe, 2, 9)
+    states = collect(domain, tmp_path, 2, video_task.STATES, seed=9)
     of_states = np.asarray(states.for_training(ids))
     np.testing.assert_array_equal(of_states, video_task.record_states(9, ids, 2))
     np.testing.assert_array_equal(states.for_encoding(ids, 1), of_states[:, :1])
@@ -166,26 +162,26 @@ def test_recordings_of_both_kinds_are_those_of_the_simulations(tmp_path: Path) -
 
 @pytest.mark.unit
 def test_stored_frames_are_gone_on_with_and_belong_to_their_poses(tmp_path: Path) -> None:
-    domain = Domain.of(video_task.TASK, None)
-    made = collect(tmp_path, video_task.VIDEO, domain.universe, 1, 9, stores_drawn=True)
+    domain = Domain.of(video_task.TASK)
+    made = collect(domain, tmp_path, 1, video_task.VIDEO, stores_drawn=True, seed=9)
     assert made.drawn is not None
     before = made.drawn.hash
-    data = np.lib.format.open_memmap(tmp_path / "frames-1" / "recordings.npy", "r+")
+    data = np.lib.format.open_memmap(tmp_path / TOY / "frames-1" / "recordings.npy", "r+")
     data[3] = 0  # A damaged action is drawn again.
     data.flush()
     with pytest.warns(UserWarning, match="action 3 is damaged"):
-        again = collect(tmp_path, video_task.VIDEO, domain.universe, 1, 9, stores_drawn=True)
+        again = collect(domain, tmp_path, 1, video_task.VIDEO, stores_drawn=True, seed=9)
     assert again.drawn is not None
     assert again.drawn.hash == before
-    shutil.rmtree(tmp_path / "poses-1")
+    shutil.rmtree(tmp_path / TOY / "poses-1")
     with pytest.raises(ObservationsError, match="drawn_from"):
-        collect(tmp_path, video_task.VIDEO, domain.universe, 1, 10, stores_drawn=True)
+        collect(domain, tmp_path, 1, video_task.VIDEO, stores_drawn=True, seed=10)
 
 
 @pytest.mark.contract
 @pytest.mark.parametrize("name", ["create-push", "create-funnel-no-subgoals", "create-analysis"])
 def test_every_create_task_has_videos(name: str) -> None:
-    domain = Domain.of(load_task(name), None)
+    domain = Domain.of(load_task(name))
     for representation in ("hvae-video", "vae-video-oracle"):
         kind, play, modality = parse_representation(domain, representation)
         assert kind == representation.partition("-")[0]
@@ -193,8 +189,7 @@ def test_every_create_task_has_videos(name: str) -> None:
         assert play.seen.shape == (7, 48, 48, 1)
         assert set(play.stage_one) == {"smoke", "laptop", "paper"}
         budget = domain.stage_one(play, "paper")
-        config = budget.configs[kind]
-        # Spec method 3, column CREATE video; method 4 of images.
+        config = getattr(budget, kind)
         sizes = config.actions_per_batch, config.recordings_per_action, config.num_steps
         assert (sizes, budget.num_recordings) == ((32, 45, 170_000), 1024)
         assert not budget.stores_drawn
@@ -212,7 +207,7 @@ def test_every_create_task_has_videos(name: str) -> None:
     frames = play.drawing.draw(np.array([last - 1]), poses)
     expected = record_images(5, [last - 1], 1, PlayConfig(angle_spacing=spacing))
     np.testing.assert_array_equal(frames[..., 0], expected[0])
-    assert parse_representation(domain, "hvae").play is domain.task.play
+    assert parse_representation(domain, "hvae").play is domain.play
     assert domain.stage_one(domain.play, "smoke").num_recordings == 4
     with pytest.raises(UsageError, match="hvae-position, hvae-video, vae-state"):
         parse_representation(domain, "hvae-film")

@@ -20,15 +20,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnew import collection
 from jaxnew.actions import ActionUniverse
+from jaxnew.collection import collect, load
 from jaxnew.observations import (
-    Recordings,
     ObservationsError,
     RecordingFormat,
+    Recordings,
     action_rng,
 )
-from jaxnew.collection import collect, load
 from jaxnew.storage.files import take_lock
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -470,7 +469,7 @@ def test_recordings_need_no_jax() -> None:
         timeout=60,
     )
     assert done.stdout.strip() == "False"
-    
+
 
 if __name__ == "__main__":
 

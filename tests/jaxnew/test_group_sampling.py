@@ -1,4 +1,4 @@
-"""Sets drawn from half of the groups of a pool (spec method 2.2, cluster sampling)."""
+"""Sets drawn from half of the groups of a pool (docs/method.md, cluster sampling)."""
 
 from __future__ import annotations
 

@@ -19,8 +19,9 @@ from envs_mjx.grid_world import GridWorld, skill_universe
 from jaxnew import sampling
 from jaxnew.actions import random_halves_split
 from jaxnew.policy import make_method
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.sampling import ActionPool, check_set_size, draw_sets, whole_pool
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import ActionPool, Actions, AvailableSet, SetConfig, check_set_size, draw_sets
 
 draw = jax.jit(draw_sets, static_argnames=("set_size", "padded_size"))
 
@@ -156,7 +157,7 @@ def test_padding_repeats_valid_ids_and_is_masked() -> None:
 @pytest.mark.unit
 @pytest.mark.parametrize("capacity", [14, 30])  # Sorting and rejection.
 def test_always_available_actions_stand_first_and_are_not_drawn_again(capacity: int) -> None:
-    """Spec method 2.2, CREATE: the no-op is removed from the pool and put into slot 0."""
+    """As CREATE's no-op, which is removed from the pool and put into slot 0."""
     always = (5, 9)  # 9 is offered as a member too; 5 as well.
     pool = pool_of(14, capacity, always)
     assert int(pool.size) == 12
@@ -244,16 +245,6 @@ def test_check_set_size_says_what_fits() -> None:
         check_set_size(with_always, 2)
 
 
-@pytest.mark.unit
-def test_whole_pool_has_every_member_once() -> None:
-    available = whole_pool(pool_of(6, 9, (100,)))
-    assert available.ids.shape == available.mask.shape == (10,)
-    real = available.ids[available.mask].tolist()
-    assert sorted(real) == [3, 5, 7, 9, 11, 13, 100]
-    assert real[0] == 100
-    assert set(available.ids.tolist()) == set(real)
-
-
 @pytest.mark.property
 @settings(max_examples=200, deadline=None, derandomize=True)
 @given(
@@ -279,7 +270,7 @@ def test_random_below_is_the_scaled_word(bits: list[int], bound: int) -> None:
 @pytest.mark.property
 @pytest.mark.parametrize("split_name", ["train", "validation"])
 def test_grid_world_sets_are_new_at_each_reset(split_name: str) -> None:
-    """Spec grid_world 9, check 18: 50 distinct ids of the requested split, new at each reset."""
+    """50 distinct ids of the requested split (docs/grid_world.md, "Splits and action sets")."""
     ids, done = collect_grid_world_sets(split_name)
     allowed = random_halves_split(skill_universe(), seed=0).ids(split_name)
     num_steps, num_envs, m = ids.shape
@@ -302,14 +293,13 @@ def collect_grid_world_sets(split_name: str) -> tuple[np.ndarray, np.ndarray]:
     """(ids int[T, N, 50], done bool[T, N]) of two rollouts in a row."""
     rollout, collect = grid_world_rollout()
     split = random_halves_split(skill_universe(), seed=0)
-    pool = ActionPool.of(split.ids(split_name), capacity=1024)
-    state = jax.jit(rollout.init)(jax.random.key(10), pool)
-    params = rollout.method.init(jax.random.key(11), state.observation[0], 3)
     table = jax.random.normal(jax.random.key(12), (1024, 3))
+    actions = Actions.of(table, split.ids(split_name), 50)
+    state = jax.jit(rollout.init)(jax.random.key(10), actions)
+    params = rollout.method.init(jax.random.key(11), state.observation[0], 3)
     batches = []
     for seed in (13, 14):
-        key = jax.random.key(seed)
-        state, batch, _ = collect(key, state, params, table, pool, jnp.float32(0.99))
+        state, batch, _ = collect(jax.random.key(seed), state, params, actions, jnp.float32(0.99))
         batches.append((np.asarray(batch.available.ids), np.asarray(batch.done)))
     # One program for all splits.
     assert collect._cache_size() == 1
@@ -322,3 +312,122 @@ def grid_world_rollout() -> tuple[DeviceRollout, Any]:
     config = RolloutConfig(num_envs=6, num_steps=30)
     rollout = DeviceRollout(env, env.default_params, make_method("ours"), config)
     return rollout, jax.jit(rollout.collect)
+
+
+# What a policy is offered.
+
+SIZE, TABLE = 30, np.random.default_rng(3).normal(size=(30, 2)).astype(np.float32)
+IDS = np.array([21, 3, 5, 8, 13, 2, 1])
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("sizes", "message"),
+    [
+        ({"size": 0}, "size=0 must be at least 1"),
+        ({"size": 4, "padded_size": 3}, "padded_size=3 is below size=4; use 0 for no padding"),
+    ],
+)
+def test_bad_sizes_are_refused(sizes: dict[str, int], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        SetConfig(**sizes)
+
+
+@pytest.mark.unit
+def test_actions_draw_what_the_pool_draws() -> None:
+    keys = keys_of(4, 30)
+    actions = Actions.of(
+        TABLE, IDS, 4, padded_size=6, always_available=np.array([0, 21]), name="seven"
+    )
+    assert (actions.set_size, actions.padded_size, actions.is_fixed) == (4, 6, False)
+    assert actions.num_actions == 8
+    pool = ActionPool.of(IDS, capacity=SIZE, always_available=np.array([0, 21]))
+    found, expected = actions.draw(keys), draw_sets(keys, pool, 4, 6)
+    assert np.array_equal(found.ids, expected.ids)
+    assert np.array_equal(found.mask, expected.mask)
+    assert (np.asarray(found.ids)[:, :2] == [0, 21]).all()
+    # All rows may be needed, and a set's are those of its ids.
+    rows = actions.rows(actions.offered(found), found)
+    np.testing.assert_array_equal(rows, TABLE[np.asarray(found.ids)])
+    assert Actions.of(TABLE, IDS, 4).padded_size == 4
+    assert not np.asarray(Actions.of(TABLE, IDS, 4, padded_size=5).draw(keys).mask).all()
+
+
+@pytest.mark.unit
+def test_a_fixed_set_has_every_action_once_whatever_the_key() -> None:
+    """Those that are always available stand first, and are no members besides."""
+    actions = Actions.of(TABLE, IDS, always_available=np.array([0, 21]))
+    assert (actions.set_size, actions.num_actions, actions.is_fixed) == (8, 8, True)
+    available = actions.draw(keys_of(5, 3))
+    assert available.ids.shape == available.mask.shape == (actions.padded_size,) == (9,)
+    real = available.ids[available.mask].tolist()
+    assert real[:2] == [0, 21]
+    assert sorted(real) == sorted([0, *IDS])
+    assert set(available.ids.tolist()) == set(real)
+    offered = actions.offered(available)
+    np.testing.assert_array_equal(offered, TABLE[np.asarray(available.ids)])
+    assert actions.rows(offered, available) is offered
+    plain = Actions.of(TABLE, IDS)
+    assert (plain.set_size, plain.padded_size) == (7, 7)
+    assert sorted(plain.draw(keys_of(5, 1)).ids.tolist()) == sorted(IDS)
+
+
+@pytest.mark.unit
+def test_a_growing_set_is_the_beginning_of_the_whole_one() -> None:
+    actions = Actions.of(TABLE, IDS, 6, padded_size=7)
+    whole = actions.draw(keys_of(6, 4))
+    assert actions.at(whole, jnp.int32(0)) is whole
+    growing = actions.growing(2, 3)
+    assert (growing.first_size, growing.growth) == (2, 3)
+    assert np.array_equal(growing.draw(keys_of(6, 4)).ids, whole.ids)
+    for t, count in enumerate((2, 5, 6, 6)):
+        now = growing.at(whole, jnp.int32(t))
+        assert np.array_equal(now.ids, whole.ids)
+        assert np.asarray(now.mask).sum(axis=1).tolist() == [count] * 4
+    # Environments that are at different steps, on the host.
+    now = growing.at(whole, np.array([0, 1, 2, 0]))
+    assert np.asarray(now.mask).sum(axis=1).tolist() == [2, 5, 6, 2]
+    unchanging = actions.growing(2, 0).at(whole, jnp.int32(9))
+    assert np.asarray(unchanging.mask).sum(axis=1).tolist() == [2] * 4
+
+
+@pytest.mark.unit
+def test_actions_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"Sets of 8 .* from the test actions, .* 7 \(0 "):
+        Actions.of(TABLE, IDS, 8, name="the test actions")
+    with pytest.raises(ValueError, match="distinct ids"):
+        Actions.of(TABLE, np.array([4, 4]), 1)
+    with pytest.raises(ValueError, match="distinct ids and at least one"):
+        Actions.of(TABLE, np.zeros(0, np.int32))
+    with pytest.raises(ValueError, match="31 ids do not fit a pool of capacity 30"):
+        Actions.of(TABLE, np.arange(31), 2)
+    with pytest.raises(ValueError, match="every half of the 7 groups"):
+        Actions.of(TABLE, IDS, 4, groups=np.arange(7))
+    actions = Actions.of(TABLE, IDS, 4)
+    for sizes in ((5, 1), (-1, 1), (2, -1)):
+        with pytest.raises(ValueError, match=rf"first_size={sizes[0]} must be in 0\.\.4"):
+            actions.growing(*sizes)
+
+
+@pytest.mark.unit
+def test_one_trace_serves_train_validation_and_test_actions() -> None:
+    """Another table, other actions and other numbers of them; only sizes are static."""
+    num_traces = 0
+
+    @jax.jit
+    def counted(keys: jax.Array, actions: Actions) -> tuple[AvailableSet, jax.Array]:
+        nonlocal num_traces
+        num_traces += 1
+        available = actions.draw(keys)
+        return available, actions.rows(actions.offered(available), available)
+
+    split = random_halves_split(skill_universe(), seed=0)
+    table = np.random.default_rng(0).normal(size=(1024, 3)).astype(np.float32)
+    for number, part in enumerate(("train", "validation", "test")):
+        actions = Actions.of(table + number, split.ids(part), 50)
+        available, rows = counted(keys_of(9, 40), actions)
+        assert np.isin(available.ids, split.ids(part)).all()
+        np.testing.assert_array_equal(rows, (table + number)[np.asarray(available.ids)])
+    assert num_traces == 1
+    counted(keys_of(9, 40), Actions.of(table, split.test, 49))
+    assert num_traces == 2

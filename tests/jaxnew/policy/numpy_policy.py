@@ -1,4 +1,7 @@
-"""The policy of spec method 5.2 and 5.3 in float64 NumPy, on parameters of `UtilityMethod`."""
+"""The utility policy in float64 NumPy, on parameters of `UtilityMethod`.
+
+Written from `docs/method.md`, "Policy networks".
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Positions and stop bits that come with a choice (spec method 5.4, 5.5)."""
+"""Positions and stop bits that come with a choice."""
 
 from __future__ import annotations
 

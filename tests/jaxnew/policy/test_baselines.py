@@ -1,4 +1,4 @@
-"""The paper's baselines (spec method 8.1, 8.2) and random play behind the interface of ours."""
+"""The paper's baselines and random play behind the interface of ours."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from scipy import stats
 from scipy.special import log_softmax
 
 from jaxnew.policy import make_method
-from jaxnew.policy._nearest import nearest_id
 from jaxnew.policy.continuous import ContinuousMethod, DiagonalGaussian
 from jaxnew.policy.discrete import DiscreteMethod
+from jaxnew.policy.distributions import nearest_id
 from jaxnew.policy.method import MethodContext
 from jaxnew.sampling import AvailableSet
 from tests.jaxnew.policy import numpy_policy

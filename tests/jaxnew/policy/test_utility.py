@@ -1,4 +1,4 @@
-"""The utility policy (spec method 5.2 and 5.3): a function of a set, as the paper writes it."""
+"""The utility policy (paper section 4.2): a function of a set, as the paper writes it."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_padding_is_not_seen(params: Any, inputs: Any) -> None:
 
 @pytest.mark.unit
 def test_parameter_counts_are_those_of_the_release(fresh: Any) -> None:
-    """Spec method 5.4, used layers only. Grid World, 81 numbers seen, d = 16:
+    """Used layers only. Grid World, 81 numbers seen, d = 16:
 
     actor    81*64 + 64 + 64*64 + 64 = 9,408
     critic   9,408 + 64 + 1          = 9,473

@@ -1,4 +1,4 @@
-"""Networks for images in plain NumPy and SciPy, float64, written from spec method 3.2 and 3.6."""
+"""Networks for images in plain NumPy and SciPy, float64, written from `docs/method.md`, "HVAE"."""
 
 import numpy as np
 import stage1_reference as reference

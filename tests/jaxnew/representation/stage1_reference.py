@@ -1,4 +1,6 @@
-"""Stage 1 in plain NumPy, float64, written from spec method 3: loops, no vectorised cleverness.
+"""Stage 1 in plain NumPy, float64: loops, no vectorised cleverness.
+
+Written from `docs/method.md`, "HVAE", "Objective of stage 1" and "Flat VAE".
 
 Parameters come as the nested dict of the Flax modules.
 """
@@ -183,7 +185,7 @@ def hvae(p, x, action_noise, observation_noise, num_categories=0):
 
 
 def flat_vae(p, x, observation_noise):
-    """One training pass of the flat VAE (spec method 4): (reconstruction, kl)."""
+    """One training pass of the flat VAE: (reconstruction, kl)."""
     p, x = as_float64(p), np.asarray(x, np.float64)
     h = np.array([[encode_recording(p["encoder"], one) for one in rows] for rows in x])
     head = p["inference"]["LatentHead_0"]

@@ -1,4 +1,4 @@
-"""Images as recordings (spec method 3.2, 3.6) against NumPy and SciPy, and their sizes."""
+"""Images as recordings against NumPy and SciPy, and their sizes."""
 
 import functools
 from dataclasses import replace
@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage1_reference as reference
-from test_representation_networks import random_variables
+from test_hvae import random_variables
 
 from jaxnew.representation import images, objective
 from jaxnew.representation.config import RepresentationConfig
@@ -86,7 +86,7 @@ def test_frames_become_codes_and_codes_become_frames(side):
 
 @pytest.mark.unit
 def test_convolutions_start_as_pytorchs():
-    """Uniform in +-1/sqrt(fan_in); a transposed one counts its outputs (spec method 3.1)."""
+    """Uniform in +-1/sqrt(fan_in); a transposed one counts its outputs."""
     x = np.zeros((1, 4, 4, 16), np.float32)
     plain = images.Convolution(32)
     up = images.TransposedConvolution(images._Upsampling(8, 3, 1))
@@ -180,10 +180,10 @@ def count(model, num_steps):
 
 @pytest.mark.golden
 def test_parameter_counts_are_the_specs_without_its_unused_layers():
-    # Spec method 3 counts 1,583,280 (video) and 1,429,938 (still images) "including unused layers".
-    # Unused are Lin(dz, H) for a second stochastic layer in q(z|o,c) and in p(z|c) (spec 3.5),
+    # The release has 1,583,280 (video) and 1,429,938 (still images), unused layers included. These
+    # are Lin(dz, H) for a second stochastic layer in q(z|o,c) and in p(z|c),
     # 128 * 128 + 128 each, and the log-variance of the 288 numbers that the LSTM or MLP decoder
-    # predicts, which is discarded (spec 3.6).
+    # predicts, which is discarded.
     unused = 2 * (128 * 128 + 128) + 288
     sizes = {
         "encoder_width": 128,
@@ -256,7 +256,7 @@ def test_a_learner_trains_on_stored_videos():
 
 @pytest.mark.unit
 def test_the_flat_vae_of_images_draws_the_batches_of_the_hvae():
-    """Spec method 4: 32 actions with 52 images each, epochs as there."""
+    """In the paper's setting 32 actions with 52 images each, epochs as there."""
     config = RepresentationConfig(
         kind="vae", observation_latent=2, actions_per_batch=2, recordings_per_action=3
     )
@@ -274,11 +274,13 @@ def test_the_flat_vae_of_images_draws_the_batches_of_the_hvae():
     class State:
         key_epochs, key_steps, step = key, jax.random.key(1), jnp.int32(5)
 
-    features, epoch, _ = learner._draw(State, recordings)
-    expected, same_epoch, _ = pooled._draw(State, recordings)
+    features, expected = (
+        each._features(recordings[each._choice(State, recordings.shape)])
+        for each in (learner, pooled)
+    )
     assert features.shape == (2, 3, 1, 84 * 84 * 3)
-    assert int(epoch) == int(same_epoch) == 2
     np.testing.assert_array_equal(features, expected)
+    assert [int(each._batches.epoch(State.step, 4)) for each in (learner, pooled)] == [2, 2]
 
 
 @pytest.mark.unit

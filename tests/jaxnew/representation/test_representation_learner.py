@@ -108,10 +108,9 @@ def test_flat_vae_batches_pool_all_actions_with_replacement():
 @pytest.mark.unit
 def test_flat_vae_draws_as_many_recordings_as_divide_evenly():
     config = learner.RepresentationConfig(kind="vae")
-    stage1 = learner.RepresentationLearner(config, XY)
-    assert stage1._flat_batch_size(512) == 86_016  # Spec method 4, Grid World.
+    assert batches.Batches.of(config, XY).pooled_size(512) == 86_016  # Grid World.
     create = dataclasses.replace(config, recordings_per_action=464)
-    assert learner.RepresentationLearner(create, XY)._flat_batch_size(1098) == 59_292  # CREATE.
+    assert batches.Batches.of(create, XY).pooled_size(1098) == 59_292  # CREATE.
 
 
 @pytest.mark.property
@@ -157,12 +156,12 @@ def test_every_step_draws_a_batch_and_noise_of_its_own(tiny, flat):
     ]
     assert len({float(of_step["reconstruction"]) for of_step in metrics}) == 3
     stage1 = learner.RepresentationLearner(dataclasses.replace(TINY, actions_per_batch=1), XY)
-    features, _, noise = zip(
-        *(stage1._draw(tiny[2].replace(step=jnp.int32(step)), tiny[1][:1]) for step in (0, 1, 2)),
-        strict=True,
-    )
-    assert len({np.asarray(x).tobytes() for x in features}) == 3
-    assert len({jax.random.key_data(key).tobytes() for key in noise}) == 3
+    states = [tiny[2].replace(step=jnp.int32(step)) for step in (0, 1, 2)]
+    recordings = tiny[1][:1]
+    drawn = [recordings[stage1._choice(state, recordings.shape)] for state in states]
+    assert len({np.asarray(x).tobytes() for x in drawn}) == 3
+    noise = [jax.random.key_data(stage1._step_keys(state)[1]) for state in states]
+    assert len({key.tobytes() for key in noise}) == 3
 
 
 @pytest.mark.unit
@@ -436,7 +435,7 @@ def _leaves(params):
 
 
 def _check_lstms(params):
-    """All LSTM weights and both biases are uniform in +-1 / sqrt(hidden) (spec method 3.1)."""
+    """All LSTM weights and both biases are uniform in +-1 / sqrt(hidden)."""
     tree = dict(_leaves(params))
     hidden_kernels = [path for path in tree if path[-1] == "kernel_hidden"]
     assert len(hidden_kernels) == 5  # Two directions in two layers, and the decoder.

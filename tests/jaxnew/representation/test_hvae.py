@@ -73,7 +73,7 @@ def test_each_lstm_bias_counts():
 
 @pytest.mark.oracle
 def test_still_images_are_sequences_of_length_one():
-    """Spec method 3.2: the LSTM reads encoded images with T = 1."""
+    """The LSTM reads encoded still images as T = 1."""
     x = np.random.default_rng(1).normal(size=(1, 3, 1, 4)).astype(np.float32)
     module = encoders.TrajectoryEncoder(5)
     variables = random_variables(module, x)
@@ -118,7 +118,7 @@ def test_scalar_batch_norm_has_one_mean_and_variance():
 
 
 @pytest.mark.oracle
-def test_action_inference_averages_after_its_last_layer_as_in_the_spec():
+def test_action_inference_averages_after_its_last_layer_as_in_the_release():
     h = np.random.default_rng(4).normal(size=(5, 3, 4)).astype(np.float32)
     module = ActionInference(width=6, latent=2)
     variables = random_variables(module, h, False)
@@ -154,7 +154,7 @@ def noise(seed, num_actions, num_recordings, action_latent=3, observation_latent
 
 @pytest.mark.oracle
 @pytest.mark.parametrize("num_categories", [0, 4])
-def test_the_whole_hvae_equals_the_spec_in_numpy(num_categories):
+def test_the_whole_hvae_equals_numpy(num_categories):
     rng = np.random.default_rng(5)
     if num_categories:
         features = np.eye(4)[rng.integers(0, 4, (3, 4, 3, 2))].reshape(3, 4, 3, 8)
@@ -174,7 +174,7 @@ def test_the_whole_hvae_equals_the_spec_in_numpy(num_categories):
 
 
 @pytest.mark.oracle
-def test_the_whole_flat_vae_equals_the_spec_in_numpy():
+def test_the_whole_flat_vae_equals_numpy():
     features = np.random.default_rng(7).uniform(0, 9, (1, 6, 3, 2)).astype(np.float32)
     model = FlatVAE(encoder_width=5, hidden_width=12, observation_latent=2, gaussian_dim=2)
     draws = noise(8, 1, 6)
@@ -197,11 +197,11 @@ def count(model, dim, num_steps=3):
 
 
 @pytest.mark.golden
-def test_parameter_counts_are_the_specs_without_its_unused_layers():
-    # Spec method 3 counts 341,994 (xy) and 443,430 (one-hot) "including unused layers". Unused are,
-    # in both, a Lin(dz, H) for a second stochastic layer in q(z|o,c) and in p(z|c) (spec 3.5),
+def test_parameter_counts_are_the_releases_without_its_unused_layers():
+    # The release has 341,994 (xy) and 443,430 (one-hot), unused layers included: in both
+    # a Lin(dz, H) for a second stochastic layer in q(z|o,c) and in p(z|c),
     # 16 * 64 + 64 = 1,088 each; in one-hot also the free log-variance of 160 features, which a
-    # categorical likelihood does not read (spec 3.7).
+    # categorical likelihood does not read.
     unused = 2 * (16 * 64 + 64)
     sizes = {
         "encoder_width": 64,
@@ -212,6 +212,6 @@ def test_parameter_counts_are_the_specs_without_its_unused_layers():
     }
     assert count(HVAE(**sizes, gaussian_dim=2), 2) == 341_994 - unused
     assert count(HVAE(**sizes, gaussian_dim=0), 160) == 443_430 - unused - 160
-    # CREATE's state modality: D = 6, T = 7, latents of 128 (spec method 3), same two layers unused.
+    # CREATE's state modality: D = 6, T = 7, latents of 128, same two layers unused.
     sizes |= {"action_latent": 128, "observation_latent": 128}
     assert count(HVAE(**sizes, gaussian_dim=6), 6) == 431_250 - 2 * (128 * 64 + 64)

@@ -1,4 +1,4 @@
-"""What fine-tuning begins with (spec method 9)."""
+"""What fine-tuning begins with (docs/method.md, "Fine-tuning")."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from experiments.finetune import warm_start
 from jaxnew.ppo import TrainState
+from jaxnew.run import Run
+from jaxnew.training import _warm_start
 
 pytestmark = pytest.mark.unit
 
@@ -33,20 +34,28 @@ def started(policy: str) -> tuple[TrainState, TrainState, TrainState]:
     """What a policy begins with, and the trained and the fresh state that it is made of."""
     source, fresh = state_of(1.0, policy, 5, "trained"), state_of(0.0, policy, 3, "fresh")
 
-    def restarted(state: TrainState, pool: str, statistics: str) -> TrainState:
-        rollout: Any = SimpleNamespace(pool=pool, observation_statistics=statistics)
+    def restarted(state: TrainState, actions: str, statistics: str) -> TrainState:
+        rollout: Any = SimpleNamespace(actions=actions, observation_statistics=statistics)
         return dataclasses.replace(state, rollout=rollout)
 
     trainer: Any = SimpleNamespace(
-        machinery=SimpleNamespace(restarted=restarted), training_pool="test actions"
+        learner=SimpleNamespace(restarted=restarted), training="test actions"
     )
-    return warm_start(fresh, source, trainer), source, fresh
+    return _warm_start(fresh, run_of(source), trainer), source, fresh
+
+
+def run_of(state: TrainState) -> Run:
+    """A run that ended so."""
+    run: Any = SimpleNamespace(policy=state.policy)
+    return run
 
 
 def test_a_utility_policy_keeps_everything() -> None:
     state, source, _ = started("mean")
     assert state.params == source.params
-    assert state.rollout == SimpleNamespace(pool="test actions", observation_statistics="trained")
+    assert state.rollout == SimpleNamespace(
+        actions="test actions", observation_statistics="trained"
+    )
 
 
 def test_a_discrete_policy_gets_new_categorical_heads() -> None:
@@ -65,7 +74,7 @@ def test_a_discrete_policy_may_have_no_stop_bit() -> None:
     for state in (source, fresh):
         del state.params["auxiliary"]
     trainer: Any = SimpleNamespace(
-        machinery=SimpleNamespace(restarted=lambda state, *_: state), training_pool=None
+        learner=SimpleNamespace(restarted=lambda state, *_: state), training=None
     )
-    params = warm_start(fresh, source, trainer).params
+    params = _warm_start(fresh, run_of(source), trainer).params
     assert params == {"policy": fresh.params["policy"], "critic": source.params["critic"]}

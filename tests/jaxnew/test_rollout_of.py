@@ -8,8 +8,10 @@ from typing import Any
 import jax
 import pytest
 
-from experiments.pipeline.flags import UsageError, load_task
-from experiments.pipeline.machinery import machinery_of
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.task.domain import load_task
+from jaxnew.task.places import UsageError
+from jaxnew.trainer import rollout_of
 
 
 @pytest.mark.unit
@@ -26,12 +28,14 @@ def test_accelerators_evaluate_as_wide_as_they_train(
 ) -> None:
     task, nobody_asks_it = load_task(name), object()
     config = task.stage_two[budget].ppo
-    environment = task.make_environment()
-    task = replace(task, make_environment=lambda: environment)
+    environment = task.environment_of()
+    task = replace(task, make_environment=lambda **fields: environment)
     for backend, width in (("cpu", on_cpu), ("gpu", on_gpu)):
         monkeypatch.setattr(jax, "default_backend", lambda backend=backend: backend)
         method: Any = nobody_asks_it
-        assert machinery_of(task, method, config, 0, 0).evaluator.width == width
+        rollout = rollout_of(task, method, config, 0)
+        assert isinstance(rollout, DeviceRollout)
+        assert rollout.width == width
 
 
 @pytest.mark.unit

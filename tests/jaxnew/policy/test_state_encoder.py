@@ -1,4 +1,4 @@
-"""The trunk for images (spec method 5.2) and the policies on top of it."""
+"""The trunk for images and the policies on top of it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import signal
 
-from jaxnew._convolution import convolution_by_columns, convolution_by_xla
+from jaxnew.convolution import convolution_by_columns, convolution_by_xla
 from jaxnew.environment import ActionSpec
 from jaxnew.policy import distribution_and_value, make_method
 from jaxnew.policy.method import MethodContext
@@ -42,7 +42,7 @@ def shapes_of(method: Any) -> Any:
 
 @pytest.mark.golden
 def test_parameter_counts() -> None:
-    """Spec method 5.4: CREATE 61,302; Shape Stacking (4 frames, one coordinate, a stop) 61,446."""
+    """CREATE 61,302; Shape Stacking (4 frames, one coordinate, a stop) 61,446."""
     shapes = [((84, 84, 3), CREATE), ((84, 84, 4), ActionSpec(A, 1, has_stop=True))]
     found = []
     for shape, spec in shapes:
@@ -180,7 +180,7 @@ def test_every_method_acts_on_images_with_one_trunk(name: str, is_conditioned: b
 
 @pytest.mark.unit
 def test_value_and_position_reach_the_trunk() -> None:
-    """Spec method 5.2: value gradients do; 5.4: the position's head reads f(s)."""
+    """Value gradients do, and the position's head reads f(s)."""
     method = method_of()
     params = numpy_policy.randomized(shapes_of(method), 1, 0.1)
     rows = method.project(params, TABLE)[:M]
