@@ -1,4 +1,4 @@
-"""Questions about trained policies: answered from the record, evaluated only where it lacks them."""
+"""Questions about trained policies: answered from the record, else evaluated."""
 
 from __future__ import annotations
 

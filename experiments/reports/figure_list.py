@@ -108,8 +108,8 @@ FIGURES: dict[str, PaperFigure] = {
         "tools of unseen classes",
         _each(_CREATE, (Cell("ours", "hvae", split="full"),)),
         note="The paper's numbers are those of its last runs. Older runs in its release reached "
-        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`), "
-        "so that the target is uncertain.",
+        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`), so "
+        "that the target is uncertain.",
     ),
     "7b": PaperFigure(
         "bars",
@@ -171,8 +171,8 @@ FIGURES: dict[str, PaperFigure] = {
         "bars",
         "no reward for subgoals",
         _each(_CREATE, (_OURS, Cell("ours", "hvae", variant="-no-subgoals"))),
-        note='Ours is paid for the goal only (docs/create.md, "Rewards"); the release does not record which '
-        "rewards the paper's runs lacked.",
+        note='Ours is paid for the goal only (docs/create.md, "Rewards"); the release does not record '
+        "which rewards the paper's runs lacked.",
     ),
     "21": PaperFigure(
         "bars",

@@ -103,7 +103,6 @@ def make_finetuned(tuning: Tuning, groups: Sequence[Group], num_episodes: int) -
     curves = {}
     for group in groups:
         method, metric = group.config["method"], f"episode/{group.task.selection_metric}"
-        updates, _ = tuning.size(method)
         for kind, name in _KINDS.items():
             runs = []
             for run in group.runs:

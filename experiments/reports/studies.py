@@ -190,8 +190,8 @@ def paper_point(kind: StudyKind, group: Group, value: float) -> PaperValue | Non
 
 
 def _analysed(group: Group) -> str | None:
-    """`ours` for the one setting of the paper's analyses; their encoder had seen the whole universe,
-    which is an oracle's (docs/create.md, "Analysis").
+    """`ours` for the one setting of the paper's analyses, whose encoder was an oracle
+    (docs/create.md, "Analysis").
     """
     is_other = group.is_ours_alone or group.config["conditions_position"]
     if group.paper_environment is None or is_other:
