@@ -53,16 +53,24 @@ ARGUMENTS.define("float", "steps", 0.0, "Environment steps of a search's runs; 0
 ARGUMENTS.define("bool", "dry_run", False, "Of a search, only say what is missing.")
 ARGUMENTS.define("string", "out", None, "Where to write; default: `analysis/` beside the runs.")
 
+_OF_STUDIES = ("run", "encoder", "episodes")
+_OF_SEARCHES = (
+    *("task", "method", "representation", "representation_budget", "split", "split_seed"),
+    *("budget", "runs", "set", "seeds", "steps", "dry_run"),
+)
+
 
 def main() -> None:
     if ARGUMENTS.study is None:
         raise UsageError(f"Say which: --study={'|'.join([*STUDIES, *GRIDS])}.")
     values = [float(value) for value in ARGUMENTS.values]
     if ARGUMENTS.study in GRIDS:
+        ARGUMENTS.refuse(_OF_STUDIES, "for a search")
         cell, own = Cell(ARGUMENTS.method, ARGUMENTS.representation), Source.asked_for(ARGUMENTS)
         folder = own.domain.folder(own.folder)
         study = search(ARGUMENTS.study, own, cell, values, ARGUMENTS.dry_run)
     else:
+        ARGUMENTS.refuse(_OF_SEARCHES, "for a study of runs")
         paths = [Path(path) for path in ARGUMENTS.run]
         folder = Path(*paths[:1]).parent
         study = study_runs(

@@ -81,6 +81,12 @@ ARGUMENTS.define(
 )
 ARGUMENTS.define("bool", "film_pages", False, "Interactive pages as well, of stacking; needs Brax.")
 
+# Flags that are about runs yet to be made.
+_PRODUCTION = (
+    *("split", "split_seed", "budget", "representation_budget", "runs", "set", "seeds", "steps"),
+    *("finetune_steps", "episodes", "given", "dry_run"),
+)
+
 
 def main() -> None:
     paths = [Path(path) for path in ARGUMENTS.run]
@@ -89,6 +95,7 @@ def main() -> None:
     if ARGUMENTS.figure and paths:
         files = film_given(paths)
     elif ARGUMENTS.figure:
+        ARGUMENTS.refuse(("episode",), "with --figure")
         out = Path(ARGUMENTS.out) if ARGUMENTS.out else None
         source = Source.asked_for(ARGUMENTS, paper_figures.parse_given(ARGUMENTS.given))
         files = paper_figures.make(ARGUMENTS.figure, source, options(), out, ARGUMENTS.dry_run)
@@ -111,6 +118,7 @@ def film_given(paths: Sequence[Path]) -> list[Path]:
     Raises:
       UsageError: several are given, or it is no run of a policy, or of another task than `--task`.
     """
+    ARGUMENTS.refuse(("episode", "pdf", *_PRODUCTION), "with --figure=8 --run")
     runs = policies(paths)
     if len(runs) != 1:
         raise UsageError(f"Figure 8 shows one run; {len(runs)} were given.")
@@ -124,6 +132,8 @@ def film_given(paths: Sequence[Path]) -> list[Path]:
 
 def draw_given(paths: Sequence[Path]) -> list[Path]:
     """All figures of runs that are given."""
+    films = ("films", "film_size", "film_format", "film_pages")
+    ARGUMENTS.refuse(("task", "workers", *films, *_PRODUCTION), "without --figure")
     if not ARGUMENTS.out and len(paths) > 1:
         raise UsageError("Several runs: say where their figures go with --out=DIRECTORY.")
     out = Path(ARGUMENTS.out) if ARGUMENTS.out else Path(*paths[:1]) / "figures"

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
@@ -101,10 +100,9 @@ def film_run(
             rows.append(_row(episode, outcome, films[-1].relative_to(out.parent)))
     table = out.with_suffix(".csv")
     table.write_text(tables.csv_text(rows), encoding="utf-8")
+    picture = sheet(stills, title)
     if filming.criterion:
         picture = ranked_sheet(stills, Metric.of(metric), filming.criterion, title)
-    else:
-        picture = sheet(stills, title)
     return [*plots.save(picture, out.with_suffix(".png")), table, *films]
 
 
@@ -235,19 +233,16 @@ def sheet(stills: Sequence[Still], title: str = "") -> Figure:
       stills: of each.
       title: of the sheet; the share of successes is added.
     """
-    figure, every = _grid(len(stills))
-    for axes, still in zip(every, stills, strict=False):
-        _show(axes, still)
-        outcome = SUCCESS if still.is_success else FAILURE
-        axes.set_title(f"episode {still.number}: {outcome}", fontsize=9, color=_color(still))
-    _set_title(figure, title, stills, "successful")
-    return figure
+    labels = [
+        f"episode {still.number}: {SUCCESS if still.is_success else FAILURE}" for still in stills
+    ]
+    return _pictures(stills, labels, _title(title, stills, "successful"))
 
 
 def ranked_sheet(
     stills: Sequence[Still], metric: Metric, criterion: str, title: str = ""
 ) -> Figure:
-    """The last pictures of the best and of the worst episodes, with their metric below each.
+    """The last pictures of the best and of the worst episodes, with their metric above each.
 
     Args:
       stills: of all episodes; up to ten of them are shown, from best to worst.
@@ -258,37 +253,28 @@ def ranked_sheet(
     ranked = sorted(stills, key=lambda still: -still.value)
     if len(ranked) > 2 * _NUM_COLUMNS:
         ranked = ranked[:_NUM_COLUMNS] + ranked[-_NUM_COLUMNS:]
-    figure, every = _grid(len(ranked))
-    for axes, still in zip(every, ranked, strict=False):
-        _show(axes, still)
-        text = f"{metric.text(still.value)}{metric.unit} (episode {still.number})"
-        axes.set_xlabel(text, fontsize=9, color=_color(still))
-    chosen = "" if len(ranked) == len(stills) else f", best and worst of {len(stills)}"
-    _set_title(figure, f"{title}{chosen}", stills, criterion)
+        title += f", best and worst of {len(stills)}"
+    labels = [f"{metric.text(s.value)}{metric.unit} (episode {s.number})" for s in ranked]
+    return _pictures(ranked, labels, _title(title, stills, criterion))
+
+
+def _pictures(stills: Sequence[Still], labels: Sequence[str], title: str) -> Figure:
+    """Pictures in rows of five, with a label above each in the colour of its outcome."""
+    num_rows = -(-len(stills) // _NUM_COLUMNS)
+    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
+    every = figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel()
+    for axes, still, label in zip(every, stills, labels, strict=False):
+        axes.imshow(still.picture, interpolation="none")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.spines[:].set_color(plots.GRID_COLOR)
+        axes.set_title(label, fontsize=9, color=_GOOD if still.is_success else _BAD)
+    for axes in every[len(stills) :]:
+        axes.set_axis_off()
+    plots.set_title(figure, title)
     return figure
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with room for so many pictures."""
-    num_rows = -(-count // _NUM_COLUMNS)
-    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
-    every = list(figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel())
-    for axes in every[count:]:
-        axes.set_axis_off()
-    return figure, every
-
-
-def _show(axes: Axes, still: Still) -> None:
-    axes.imshow(still.picture, interpolation="none")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_color(plots.GRID_COLOR)
-
-
-def _color(still: Still) -> str:
-    return _GOOD if still.is_success else _BAD
-
-
-def _set_title(figure: Figure, title: str, stills: Sequence[Still], criterion: str) -> None:
+def _title(title: str, stills: Sequence[Still], criterion: str) -> str:
     share = f"{sum(still.is_success for still in stills)} of {len(stills)} {criterion}"
-    plots.set_title(figure, f"{title} ({share})" if title else share)
+    return f"{title} ({share})" if title else share

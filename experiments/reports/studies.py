@@ -185,7 +185,7 @@ def paper_point(kind: StudyKind, group: Group, value: float) -> PaperValue | Non
     wanted = kind.paper_method(name, value)
     for row in paper_results(str(group.paper_environment)):
         if (row.method, row.split) == (wanted, "test"):
-            return PaperValue(row.mean, row.std, row.num_seeds)
+            return row.value
     return None
 
 

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from experiments import analyze
 from experiments.reports.studies import encoded_test_actions
 from experiments.tasks.grid_world import TASK
 from jaxnew import collection
@@ -76,6 +78,18 @@ def test_sizes_ratios_growth_and_recordings(runs: Path) -> None:
     )
     assert stored["num_actions"] == 256
     assert found["unseen-ratio"][1] == whole
+
+
+@pytest.mark.unit
+def test_flags_of_the_other_kind_are_refused() -> None:
+    for flags, message in (
+        (["--study=entropy", "--run=a"], "--run: of no meaning for a search"),
+        (["--study=set-size", "--steps=1"], "--steps: of no meaning for a study of runs"),
+        ([], "Say which: --study=set-size|unseen-ratio|"),
+    ):
+        analyze.ARGUMENTS.parse(flags)
+        with pytest.raises(UsageError, match=re.escape(message)):
+            analyze.main()
 
 
 @pytest.mark.integration

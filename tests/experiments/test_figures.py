@@ -101,6 +101,12 @@ def test_command_asks_for_what_it_needs(tmp_path: Path) -> None:
     path = write_run(tmp_path / "embed", {**embedded, "model": {}})
     with pytest.raises(UsageError, match="This needs a run of train"):
         call(f"--run={path}", "--episode")
+    with pytest.raises(UsageError, match="--task, --seeds: of no meaning without --figure"):
+        call(f"--run={one}", "--seeds=1", "--task=grid_world")
+    with pytest.raises(UsageError, match="--episodes: of no meaning with --figure=8 --run"):
+        call(f"--run={one}", "--figure=8", "--episodes=3")
+    with pytest.raises(UsageError, match="--episode: of no meaning with --figure"):
+        call("--figure=4", "--episode")
     with pytest.raises(UsageError, match="Unknown command line flag 'seed'"):
         call("--seed=1")
 

@@ -144,18 +144,18 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
     figure = films.ranked_sheet(stills, Metric.of("final_height"), "at least 1.5 m", "Figure 8")
     title = "Figure 8, best and worst of 12 (7 of 12 at least 1.5 m)"
     assert figure.get_suptitle() == title
-    shown = [(a.get_xlabel(), int(a.images[0].get_array()[0, 0, 0]) // 20) for a in figure.axes]
+    shown = [(a.get_title(), int(a.images[0].get_array()[0, 0, 0]) // 20) for a in figure.axes]
     best = [1, 8, 6, 11, 3]
     worst = [9, 2, 7, 0, 4]
     assert [number for _, number in shown] == best + worst
     assert shown[0][0] == "3.250 m (episode 1)"
     assert shown[9][0] == "0.250 m (episode 4)"
-    colors = [axes.xaxis.label.get_color() for axes in figure.axes]
+    colors = [axes.title.get_color() for axes in figure.axes]
     assert len(set(colors[:5])) == len(set(colors[5:])) == 1
     assert colors[0] != colors[5]
     few = films.ranked_sheet(stills[:3], Metric.of("final_height"), "at least 1.5 m", "Figure 8")
     assert few.get_suptitle() == "Figure 8 (1 of 3 at least 1.5 m)"
-    assert [axes.get_xlabel()[:5] for axes in few.axes[:3]] == ["3.250", "1.000", "0.500"]
+    assert [axes.get_title()[:5] for axes in few.axes[:3]] == ["3.250", "1.000", "0.500"]
 
 
 @pytest.mark.integration
