@@ -168,7 +168,8 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
     if groups:
         rows = {group.label: result_rows(group) for group in groups}
         notes = [note for group in groups for note in missing_from(group)]
-        print("\n".join(notes))
+        for note in notes:
+            print(note)
         for name, figure in (
             ("learning_curves", curves_figure(groups)),
             ("bars", bars_figure(groups, rows)),

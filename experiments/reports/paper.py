@@ -61,6 +61,14 @@ class PaperError(ValueError):
     """The paper has no such environment, method, split or figure."""
 
 
+class PaperValue(NamedTuple):
+    """Mean and population standard deviation over the paper's seeds."""
+
+    mean: float
+    std: float
+    num_seeds: int
+
+
 @dataclass(frozen=True)
 class PaperResult:
     """One bar of the paper, or one point of an analysis.
@@ -80,14 +88,6 @@ class PaperResult:
     split: str
     metric: str
     value: PaperValue
-
-
-class PaperValue(NamedTuple):
-    """Mean and population standard deviation over the paper's seeds."""
-
-    mean: float
-    std: float
-    num_seeds: int
 
 
 class PaperCurve(NamedTuple):
@@ -237,7 +237,7 @@ def _check_split(split: str) -> None:
 def _results() -> list[PaperResult]:
     return [
         PaperResult(
-            *(row[name] for name in ("figure", "environment", "method", "split", "metric")),
+            *(row["figure"], row["environment"], row["method"], row["split"], row["metric"]),
             PaperValue(float(row["mean"]), float(row["std"]), int(row["n_seeds"])),
         )
         for row in _rows("results.csv")

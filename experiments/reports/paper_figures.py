@@ -226,14 +226,15 @@ def draw_curves(
 
 
 def table_of(source: Source, representation: str) -> RepresentationTable:
-    """A representation that is given, engineered or trained."""
-    given = source.table_of(representation)
-    if given is not None:
-        return given
-    path = source.embed_folder(representation) / TABLE_FILE
-    if path.exists():
-        return RepresentationTable.load(path)
-    return find_table(source.domain, source.folder, representation, source.stage_one)
+    """A representation that is given, engineered or trained.
+
+    Raises:
+      SplitMismatch: the one that is given belongs to other actions or another split.
+    """
+    folder = source.embed_folder(representation)
+    trained = folder if (folder / TABLE_FILE).exists() else representation
+    place = source.given.get(representation, trained)
+    return find_table(source.domain, source.folder, str(place), source.stage_one)
 
 
 def group_of(source: Source, cell: Cell) -> Group:

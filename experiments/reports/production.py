@@ -14,6 +14,7 @@ import numpy as np
 from experiments.reports.runs import RunRecord, read_runs
 from jaxnew.embedding import REPRESENTATION_SEED, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage.config import ConfigError
 from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
@@ -184,7 +185,7 @@ def policies_below(folder: Path) -> list[RunRecord]:
     for file in sorted(folder.rglob("config.json")):
         if "members.partial" in file.parts:  # Of a sweep that is being written.
             continue
-        with suppress(ValueError, RunDirectoryError):
+        with suppress(UsageError, ConfigError, RunDirectoryError):
             runs += [run for run in read_runs([file.parent]) if run.path == file.parent.resolve()]
     return [run for run in runs if run.is_policy]
 

@@ -124,12 +124,12 @@ def _result_row(group: Group, evaluations: list[tuple[RunRecord, dict[str, Any]]
             np.mean([e["step"] * run.steps_per_update for run, e in evaluations])
         ),
         trained_steps=float(np.mean([run.trained_steps for run in runs])),
-        paper_method=group.paper_method if paper else None,
-        paper_mean=paper.mean if paper else None,
-        paper_std=paper.std if paper else None,
-        paper_num_seeds=paper.num_seeds if paper else None,
-        paper_steps=paper_steps(str(group.paper_environment)) if paper else None,
-        difference=scale * (mean - paper.mean) if paper else None,
+        paper_method=paper and group.paper_method,
+        paper_mean=paper and paper.mean,
+        paper_std=paper and paper.std,
+        paper_num_seeds=paper and paper.num_seeds,
+        paper_steps=paper and paper_steps(str(group.paper_environment)),
+        difference=paper and scale * (mean - paper.mean),
         runs=tuple(str(run.path) for run in runs),
     )
 

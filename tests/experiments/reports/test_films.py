@@ -28,7 +28,7 @@ from jaxnew.rollout.device import DeviceRollout
 from jaxnew.run import Run
 from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
-from jaxnew.task.presentation import Film
+from jaxnew.task.presentation import Film, Filming
 from jaxnew.task.task import Task
 from jaxnew.trainer import rollout_of
 from tests.experiments.handwritten import untrained
@@ -80,6 +80,19 @@ def test_films_are_sorted_by_the_outcome_that_they_show(toy: Path, tmp_path: Pat
         start = np.asarray(Image.open(film.with_name(f"episode-{number:03d}-start.png")))
         assert start[..., 0].max() == 255
         assert not (tmp_path / "figure_8" / other / film.name).exists()
+
+
+@pytest.mark.integration
+def test_a_film_of_another_end_is_refused(
+    toy: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def draw(environment: Any, episode: Episode, *, size: int) -> Film:
+        other = {**episode.metrics, "is_success": 1.0 - episode.metrics["is_success"]}
+        return Film([np.zeros((size, size, 3), np.uint8)], other)
+
+    monkeypatch.setattr(films, "filming_of", lambda run: Filming(draw))
+    with pytest.raises(RuntimeError, match="Episode 0 ended with .* when it was played again"):
+        film_run(toy, tmp_path / "out", options=FilmOptions(1, 16), num_workers=1)
 
 
 @pytest.mark.integration

@@ -11,7 +11,7 @@ import pytest
 
 from envs_mjx.grid_world import skill_universe
 from experiments.reports.production import Cell, find
-from experiments.reports.runs import Group
+from experiments.reports.runs import Group, group_runs
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage.config import ConfigError
 from jaxnew.task.places import UsageError
@@ -139,6 +139,7 @@ def test_figures_find_runs_of_their_own_environment_only(tmp_path: Path) -> None
         found = find(source, OURS)
         places = {seed: run.path.name for seed, run in found.items()}
         assert places == {1: name, 2: f"{name}-before"}
+        assert len(group_runs(list(found.values()))) == 1
         for run in found.values():
             group = Group("ours", source.domain.task, (run,))
             assert group.paper_method == {"plain": "ours", "changed": None}[name]
