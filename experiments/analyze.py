@@ -21,7 +21,7 @@ from pathlib import Path
 from experiments.flags import Arguments
 from experiments.reports.production import Cell, Source
 from experiments.reports.searches import GRIDS, search
-from experiments.reports.studies import STUDIES, study_runs
+from experiments.reports.studies import NAMES, study_runs
 from experiments.reports.study_report import write_study
 from jaxnew.task.places import UsageError
 
@@ -42,7 +42,7 @@ ARGUMENTS.define(
     "string",
     "study",
     None,
-    f"What to study: {', '.join([*STUDIES, *GRIDS])}, or one of the task's own.",
+    f"What to study: {', '.join([*NAMES, *GRIDS])}, or one of the task's own.",
 )
 ARGUMENTS.define("list", "run", [], "Runs of train or sweep to evaluate.")
 ARGUMENTS.define("string", "encoder", None, "Run of embed, for --study=recordings.")
@@ -62,7 +62,7 @@ _OF_SEARCHES = (
 
 def main() -> None:
     if ARGUMENTS.study is None:
-        raise UsageError(f"Say which: --study={'|'.join([*STUDIES, *GRIDS])}.")
+        raise UsageError(f"Say which: --study={'|'.join([*NAMES, *GRIDS])}.")
     values = [float(value) for value in ARGUMENTS.values]
     if ARGUMENTS.study in GRIDS:
         ARGUMENTS.refuse(_OF_STUDIES, "for a search")

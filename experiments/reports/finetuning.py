@@ -60,26 +60,23 @@ class Tuning:
             updates = self.steps / config.ppo.steps_per_update
         return max(1, math.ceil(updates)), config.ppo.steps_per_update
 
-    def folder(self, path: Path, method: str, kind: str) -> Path:
-        """Where the run that goes on from `path` is kept."""
-        return path / f"finetune-{kind}-{self.size(method)[0]}"
-
     def job(self, path: Path, method: str, seed: int, kind: str) -> Job:
         """The command that fine-tunes one run, or trains beside it from scratch."""
         source, (updates, steps_per_update) = self.source, self.size(method)
+        folder = path / f"finetune-{kind}-{updates}"
         command = (
             "finetune",
             f"--run={path}",
             f"--budget={source.budget}",
             f"--seed={seed}",
             *(f"--set={text}" for text in (*source.assignments, f"num_updates={updates}")),
-            f"--workdir={self.folder(path, method, kind)}",
+            f"--workdir={folder}",
             *(["--scratch"] if kind == "scratch" else []),
             *([f"--workers={source.workers}"] if source.workers else []),
         )
         seconds = training_seconds(source, CONTINUED[method], updates * steps_per_update)
         title = f"{variant_of(method).policy}, {kind}, seed {seed}"
-        return Job(title, command, duration(seconds), seconds)
+        return Job(title, command, duration(seconds), seconds, folder)
 
     @property
     def seconds(self) -> float | None:
@@ -106,10 +103,10 @@ def make_finetuned(tuning: Tuning, groups: Sequence[Group], num_episodes: int) -
         for kind, name in _KINDS.items():
             runs = []
             for run in group.runs:
-                folder = tuning.folder(run.path, method, kind)
-                if not (folder / "config.json").exists() or not read_runs([folder])[0].is_finished:
-                    tuning.job(run.path, method, run.config["seed"], kind).run()
-                (found,) = read_runs([folder])
+                job = tuning.job(run.path, method, run.config["seed"], kind)
+                if not job.is_done:
+                    job.run()
+                (found,) = read_runs([job.folder])
                 runs.append(RunCurve(*found.curve(metric)))
             curves[f"{variant_of(method).policy}, {name}"] = tuple(runs)
     ours = next(group for group in groups if group.config["method"] == "ours")

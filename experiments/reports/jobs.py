@@ -18,8 +18,10 @@ from typing import Any
 from experiments.main import child
 from experiments.reports.plots import amount
 from experiments.reports.production import Cell, Source
+from experiments.reports.runs import read_runs
 from jaxnew.cores import available_cores
 from jaxnew.embedding import TABLE_FILE, parse_representation
+from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.methods import file_name
 from jaxnew.task.places import UsageError
 
@@ -33,12 +35,22 @@ class Job:
       command: `python -m experiments.NAME` without its beginning.
       cost: how long it takes.
       seconds: the same as a number; None if nobody measured it.
+      folder: of the run or the sweep that it makes.
     """
 
     title: str
     command: tuple[str, ...]
     cost: str
     seconds: float | None
+    folder: Path
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all its runs are finished."""
+        try:
+            return all(run.is_finished for run in read_runs([self.folder]))
+        except (UsageError, RunDirectoryError):  # Not begun, or a sweep that is not over.
+            return False
 
     def run(self) -> None:
         """Runs the command in a process of its own, and lets it save and end on a signal.
@@ -79,7 +91,8 @@ def embed_job(source: Source, representation: str) -> Job | None:
     is_learned = representation.startswith(("hvae", "vae"))
     if not is_learned or representation in source.given:
         return None
-    if (source.embed_folder(representation) / TABLE_FILE).exists():
+    folder = source.embed_folder(representation)
+    if (folder / TABLE_FILE).exists():
         return None
     budget = domain.stage_one(parse_representation(domain, representation).play, source.stage_one)
     command = (
@@ -91,7 +104,7 @@ def embed_job(source: Source, representation: str) -> Job | None:
         f"--budget={source.stage_one}",
         f"--runs={source.folder}",
     )
-    return Job(f"Representation {representation}", command, budget.cost, None)
+    return Job(f"Representation {representation}", command, budget.cost, None, folder)
 
 
 def training_jobs(source: Source, cell: Cell, seeds: Sequence[int]) -> list[Job]:
@@ -122,7 +135,7 @@ def train_job(source: Source, cell: Cell, seed: int, folder: Path | None = None)
     if seconds is None:
         whole = source.domain.task.budget(source.budget).cost
         cost += f"; a whole run of budget {source.budget} takes {whole}"
-    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds)
+    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds, folder)
 
 
 def sweep_job(
@@ -153,7 +166,7 @@ def sweep_job(
     num_runs = len(seeds) * math.prod(values.count(",") + 1 for values in vary)
     seconds = training_seconds(source, cell.method, steps * num_runs, num_runs)
     title = f"{cell.label}, {num_runs} runs of {amount(steps)} in one program"
-    return Job(title, command, duration(seconds), seconds)
+    return Job(title, command, duration(seconds), seconds, folder)
 
 
 def _settings(source: Source, cell: Cell) -> tuple[str, ...]:

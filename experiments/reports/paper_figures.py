@@ -23,7 +23,7 @@ from experiments.reports.jobs import Job, announce, embed_job, evaluation_second
 from experiments.reports.production import Cell, Source, find
 from experiments.reports.results import as_csv, as_markdown, result_rows
 from experiments.reports.runs import Group, RunRecord
-from experiments.reports.studies import Subject, kind_of, study_runs
+from experiments.reports.studies import kind_of, study_runs
 from experiments.reports.study_report import write_study
 from jaxnew.embedding import TABLE_FILE, find_table
 from jaxnew.representation.table import RepresentationTable
@@ -156,8 +156,8 @@ def questions_of(figure: PaperFigure, group: Group) -> list[Question]:
     """What a figure of bars or of a study asks of each run of a group."""
     if figure.kind == "bars":
         return [group.standard(part) for part in BAR_SPLITS]
-    kind, subject = kind_of(figure.study, group.task), Subject(group.runs[0], group.task)
-    return [kind.asked(subject, value).question for value in kind.values(group.task)]
+    kind = kind_of(figure.study, group.task)
+    return [kind.asked(group.runs[0], value).question for value in kind.values]
 
 
 def lacking(run: RunRecord, questions: Sequence[Question], num_episodes: int) -> list[Question]:

@@ -11,10 +11,9 @@ import numpy as np
 
 from experiments.reports.jobs import Job, announce, sweep_job, train_job
 from experiments.reports.production import Cell, Source
-from experiments.reports.runs import Group, RunRecord, group_runs, read_runs
+from experiments.reports.runs import RunRecord, group_runs, read_runs
 from experiments.reports.study_report import Study, StudyPoint
 from jaxnew.ppo import PPOConfig
-from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.methods import file_name
 from jaxnew.task.places import UsageError
 
@@ -79,49 +78,29 @@ GRIDS = {
 }
 
 
-@dataclass(frozen=True)
-class Part:
-    """A command of a search, and the folder of the run or of the sweep that it makes."""
-
-    job: Job
-    folder: Path
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether all its runs are done."""
-        try:
-            return all(run.is_finished for run in read_runs([self.folder]))
-        except (UsageError, RunDirectoryError):  # Not begun, or a sweep that is not over.
-            return False
-
-
-def search_parts(name: str, source: Source, cell: Cell, values: Sequence[float]) -> list[Part]:
+def search_jobs(name: str, source: Source, cell: Cell, values: Sequence[float]) -> list[Job]:
     """The commands of a search.
 
     On the host every value and seed is a run of its own. Inside jit a value is a program, and all
     of them are one where they are traced.
     """
-    grid, seeds = GRIDS[name], "-".join(map(str, source.seeds))
+    grid, seeds, is_host = GRIDS[name], source.seeds, source.domain.task.host is not None
     words = ["search", name, file_name(cell.method), Path(cell.representation).stem, source.budget]
     updates = str(source.config_of(cell).num_updates)
     folder = source.domain.folder(source.folder) / "-".join([*words, updates])
-    if grid.traced and source.domain.task.host is None:
-        place = folder / f"all-{seeds}"
+    all_seeds = "-".join(map(str, seeds))
+    if grid.traced and not is_host:
         vary = [f"{grid.traced}={','.join(f'{value:g}' for value in values)}"]
-        return [Part(sweep_job(source, cell, source.seeds, place, vary), place)]
-    parts = []
+        return [sweep_job(source, cell, seeds, folder / f"all-{all_seeds}", vary)]
+    jobs = []
     for value in values:
-        own = grid.source(source, cell, value)
-        if source.domain.task.host is None:
-            place = folder / f"{value:g}-{seeds}"
-            found = [(sweep_job(own, cell, source.seeds, place), place)]
+        own, place = grid.source(source, cell, value), f"{value:g}"
+        if is_host:
+            found = [train_job(own, cell, seed, folder / f"{place}-{seed}") for seed in seeds]
         else:
-            places = [(seed, folder / f"{value:g}-{seed}") for seed in source.seeds]
-            found = [(train_job(own, cell, seed, place), place) for seed, place in places]
-        for job, place in found:
-            title = f"{grid.axis} {value:g}: {job.title}"
-            parts.append(Part(replace(job, title=title), place))
-    return parts
+            found = [sweep_job(own, cell, seeds, folder / f"{place}-{all_seeds}")]
+        jobs += [replace(job, title=f"{grid.axis} {place}: {job.title}") for job in found]
+    return jobs
 
 
 def search(
@@ -142,38 +121,30 @@ def search(
       UsageError: a value cannot be trained, or a command was stopped.
     """
     grid = GRIDS[name]
-    parts = search_parts(name, source, cell, tuple(values or grid.values))
-    missing = [part for part in parts if not part.is_finished]
-    announce([part.job for part in missing])
+    jobs = search_jobs(name, source, cell, tuple(values or grid.values))
+    missing = [job for job in jobs if not job.is_done]
+    announce(missing)
     if is_dry:
         return None
-    for part in missing:
-        part.job.run()
-        if not part.is_finished:
-            raise UsageError(
-                f"{part.folder} is not finished; call the same command again to go on."
-            )
-    return chosen(name, grid, read_runs([part.folder for part in parts]))
+    for job in missing:
+        job.run()
+        if not job.is_done:
+            raise UsageError(f"{job.folder} is not finished; call the same command again to go on.")
+    return chosen(name, grid, read_runs([job.folder for job in jobs]))
 
 
 def chosen(name: str, grid: Grid, runs: Sequence[RunRecord]) -> Study:
     """The runs of a search as a study of their best evaluations on validation sets."""
     groups = sorted(group_runs(runs), key=lambda group: grid.value_of(group.config))
-    points = [
-        StudyPoint(
-            group.label.split(",")[0], grid.value_of(group.config), best_validations(group), 0
-        )
-        for group in groups
-    ]
+    points = []
+    for group in groups:
+        curves = [run.curve(f"validation/{group.task.selection_metric}")[1] for run in group.runs]
+        best_of_each = np.array([curve.max() for curve in curves])
+        method = group.label.split(",")[0]
+        points.append(StudyPoint(method, grid.value_of(group.config), best_of_each, 0))
     best = max(points, key=lambda point: float(point.means.mean()))
     note = (
         f"Best evaluation on validation sets during training, mean over {len(best.means)} seeds. "
         f"Chosen by it: {grid.axis} {best.x:g}."
     )
     return Study(name, grid.axis, name == "entropy", groups[0].metric, tuple(points), note)
-
-
-def best_validations(group: Group) -> np.ndarray:
-    """f64[n] the best value on validation sets of each run."""
-    name = f"validation/{group.task.selection_metric}"
-    return np.array([run.curve(name)[1].max() for run in group.runs])

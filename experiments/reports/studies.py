@@ -23,25 +23,7 @@ from jaxnew.task.presentation import ActionStudy
 from jaxnew.task.settings import read_train_config, with_settings
 from jaxnew.task.task import Task
 
-
-@dataclass(frozen=True)
-class Subject:
-    """What is studied.
-
-    Attributes:
-      record: a run.
-      task: of the run, with the settings that are its default.
-      encoder: run of `embed`, for the study of recordings.
-    """
-
-    record: RunRecord
-    task: Task
-    encoder: Path | None = None
-
-    @property
-    def set_size(self) -> int:
-        """Actions in the sets of its training."""
-        return int(self.record.config["sets"]["size"])
+NAMES = ("set-size", "unseen-ratio", "growing-set", "recordings")  # Of those for every task.
 
 
 @dataclass(frozen=True)
@@ -53,33 +35,94 @@ class StudyKind:
       values: of the axis.
       asked: what a value asks of a run.
       note: below the table.
+      has_log_axis: see `Study`.
       paper_method: `(paper's name of the setting, value) ->` the paper's name of the point.
       figure: see `ActionStudy`.
     """
 
     axis: str
-    values: Callable[[Task], Sequence[float]]
-    asked: Callable[[Subject, float], Asked]
+    values: Sequence[float]
+    asked: Callable[[RunRecord, float], Asked]
     note: str
     has_log_axis: bool = False
     paper_method: Callable[[str, float], str] | None = None
     figure: str = ""
 
 
-def _set_size(subject: Subject, value: float) -> Asked:
-    return Asked.part(Question("test", int(value)))
+def kind_of(name: str, task: Task, encoder: Path | None = None) -> StudyKind:
+    """A study of every task, or one of this task's own.
+
+    Args:
+      encoder: run of `embed`, for the study of recordings.
+
+    Raises:
+      UsageError: there is none of that name.
+    """
+    # 10 to 60 by 5, as in the release, in proportion to the domain's sets of 50.
+    scale = task.stage_two["paper"].sets.size / 50 if "paper" in task.stage_two else 1.0
+    sizes = [float(round(scale * size)) for size in range(10, 61, 5)]
+    if name == "set-size":
+        return StudyKind(
+            "actions in a test set",
+            sizes,
+            lambda record, value: Asked.part(Question("test", int(value))),
+            "Test actions.",
+            paper_method=lambda name, value: f"{name}[test_set_size={value:g}]",
+        )
+    if name == "unseen-ratio":
+        return StudyKind(
+            "share of unseen actions in the pool",
+            [0.0, 0.2, 0.4, 0.6, 0.8, 1.0],
+            _unseen_ratio,
+            "Sets drawn from a mixture of train and test actions (paper figure 9c).",
+        )
+    if name == "growing-set":
+        return StudyKind(
+            "actions at the first step",
+            [max(1.0, sizes[0] // 2), sizes[0], sizes[3], sizes[8]],
+            partial(_growing_set, task),
+            "Test sets that begin with so many actions and grow by as many at every step as make "
+            "them complete at the last one; the last value is the whole set from the start.",
+        )
+    if name == "recordings":
+        return StudyKind(
+            "recordings per test action",
+            [1024.0, 64.0, 16.0, 4.0, 1.0],
+            partial(_recordings, encoder),
+            "Test actions encoded by the frozen encoder from their first recordings only.",
+            has_log_axis=True,
+        )
+    own = task.shown.studies
+    if name not in own:
+        listed = ", ".join([*NAMES, *own])
+        raise UsageError(f"Task {task.name} has no study {name!r}; choose one of {listed}.")
+    published = own[name].paper_method
+    return StudyKind(
+        own[name].axis,
+        own[name].values,
+        partial(_own_study, name, own[name]),
+        own[name].note,
+        # The rows of an analysis are those of its own policy, whatever the default's are called.
+        paper_method=published and (lambda _, value: published(value)),
+        figure=own[name].figure,
+    )
 
 
-def _unseen_ratio(subject: Subject, value: float) -> Asked:
-    question = Question(f"unseen-{value:g}", subject.set_size)
+def _usual(record: RunRecord) -> int:
+    """Actions in the sets of a run's training."""
+    return int(record.config["sets"]["size"])
+
+
+def _unseen_ratio(record: RunRecord, value: float) -> Asked:
+    question = Question(f"unseen-{value:g}", _usual(record))
     return Asked(question, lambda run: {"unseen_ratio": value})
 
 
-def _growing_set(subject: Subject, value: float) -> Asked:
-    size = subject.set_size
+def _growing_set(task: Task, record: RunRecord, value: float) -> Asked:
+    size = _usual(record)
     if value >= size:
         return Asked.part(Question("test", size))
-    config, task = read_train_config(subject.record.config, subject.task)
+    config, task = read_train_config(record.config, task)
     task = with_settings(task, config)
     if task.host is not None:
         steps = task.host.max_episode_steps(task.environment)
@@ -90,8 +133,7 @@ def _growing_set(subject: Subject, value: float) -> Asked:
     return Asked.part(Question("test", size, int(value), growth))
 
 
-def _recordings(subject: Subject, value: float) -> Asked:
-    encoder = subject.encoder
+def _recordings(encoder: Path | None, record: RunRecord, value: float) -> Asked:
     if encoder is None:
         raise UsageError("--study=recordings needs --encoder=RUN, a run of embed.")
 
@@ -99,82 +141,16 @@ def _recordings(subject: Subject, value: float) -> Asked:
         vectors = encoded_test_actions(encoder, run.split, int(value))
         return {"table": RepresentationTable(vectors, run.split.test)}
 
-    return Asked(Question(f"recordings-{int(value)}", subject.set_size), table)
+    return Asked(Question(f"recordings-{int(value)}", _usual(record)), table)
 
 
-def _sizes(task: Task) -> list[float]:
-    """10 to 60 by 5, as in the release, in proportion to the domain's sets of 50."""
-    scale = task.stage_two["paper"].sets.size / 50 if "paper" in task.stage_two else 1.0
-    return [float(round(scale * size)) for size in range(10, 61, 5)]
-
-
-def _first_sizes(task: Task) -> list[float]:
-    sizes = _sizes(task)
-    return [max(1.0, sizes[0] // 2), sizes[0], sizes[3], sizes[8]]
-
-
-STUDIES = {
-    "set-size": StudyKind(
-        "actions in a test set",
-        _sizes,
-        _set_size,
-        "Test actions.",
-        paper_method=lambda name, value: f"{name}[test_set_size={value:g}]",
-    ),
-    "unseen-ratio": StudyKind(
-        "share of unseen actions in the pool",
-        lambda task: [0.0, 0.2, 0.4, 0.6, 0.8, 1.0],
-        _unseen_ratio,
-        "Sets drawn from a mixture of train and test actions (paper figure 9c).",
-    ),
-    "growing-set": StudyKind(
-        "actions at the first step",
-        _first_sizes,
-        _growing_set,
-        "Test sets that begin with so many actions and grow by as many at every step as make them "
-        "complete at the last one; the last value is the whole set from the start.",
-    ),
-    "recordings": StudyKind(
-        "recordings per test action",
-        lambda task: [1024.0, 64.0, 16.0, 4.0, 1.0],
-        _recordings,
-        "Test actions encoded by the frozen encoder from their first recordings only.",
-        has_log_axis=True,
-    ),
-}
-
-
-def kind_of(name: str, task: Task) -> StudyKind:
-    """A study of every task, or one of this task's own.
-
-    Raises:
-      UsageError: there is none of that name.
-    """
-    own = task.shown.studies
-    if name in STUDIES:
-        return STUDIES[name]
-    if name not in own:
-        listed = ", ".join([*STUDIES, *own])
-        raise UsageError(f"Task {task.name} has no study {name!r}; choose one of {listed}.")
-    published = own[name].paper_method
-    return StudyKind(
-        own[name].axis,
-        lambda task: own[name].values,
-        partial(_own_study, name, own[name]),
-        own[name].note,
-        # The rows of an analysis are those of its own policy, whatever the default's are called.
-        paper_method=published and (lambda _, value: published(value)),
-        figure=own[name].figure,
-    )
-
-
-def _own_study(name: str, study: ActionStudy, subject: Subject, value: float) -> Asked:
+def _own_study(name: str, study: ActionStudy, record: RunRecord, value: float) -> Asked:
     title = f"{name}-{value:g}"
 
     def ids(run: Run) -> dict[str, Any]:
         return {"ids": {title: study.ids(np.asarray(run.trainer.training.table), value)}}
 
-    return Asked(Question(title, subject.set_size), ids)
+    return Asked(Question(title, _usual(record)), ids)
 
 
 def paper_point(kind: StudyKind, group: Group, value: float) -> PaperValue | None:
@@ -223,13 +199,13 @@ def study_runs(
     """
     groups = group_runs(policies(paths))
     first = groups[0]
-    kind = kind_of(name, first.task)
-    axis = [float(value) for value in values or kind.values(first.task)]
+    kind = kind_of(name, first.task, encoder)
+    axis = [float(value) for value in values or kind.values]
     points = []
     for group in groups:
         rows = []
         for run in group.runs:
-            asked = [kind.asked(Subject(run, group.task, encoder), value) for value in axis]
+            asked = [kind.asked(run, value) for value in axis]
             rows.append(answers_of(run, asked, num_episodes, num_workers))
         metric = group.task.selection_metric
         for value, of_value in zip(axis, zip(*rows, strict=True), strict=True):

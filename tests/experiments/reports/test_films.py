@@ -91,7 +91,7 @@ def test_a_film_of_another_end_is_refused(
         return Film([np.zeros((size, size, 3), np.uint8)], other)
 
     monkeypatch.setattr(films, "filming_of", lambda run: Filming(draw))
-    with pytest.raises(RuntimeError, match="Episode 0 ended with .* when it was played again"):
+    with pytest.raises(RuntimeError, match=r"Episode 0 ended with .* when it was played again"):
         film_run(toy, tmp_path / "out", options=FilmOptions(1, 16), num_workers=1)
 
 

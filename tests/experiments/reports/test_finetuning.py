@@ -38,7 +38,7 @@ def test_fine_tuning_is_drawn_from_its_runs(
         paths.append(finished(source, Cell(method, "gt12")))
         assert tuning.size(method) == (2, 256)  # 512 steps of 256 an update.
         for kind, success in (("warm", 0.5), ("scratch", 0.25)):
-            folder = tuning.folder(paths[-1], method, kind)
+            folder = tuning.job(paths[-1], method, 1, kind).folder
             config = config_of(source, Cell(method, "gt12"))
             config |= {"trained_on": "test", "num_updates": 2}
             write_run(folder, config, curve=(0.1,))

@@ -65,7 +65,7 @@ def test_what_is_missing_becomes_a_command_with_its_duration(tmp_path: Path) -> 
 def test_a_command_that_fails_ends_the_plan(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(UsageError, match="ended with status 1: python -m"):
-        Job("it", ("sweep", "--x"), "seconds", None).run()
+        Job("it", ("sweep", "--x"), "seconds", None, Path()).run()
 
 
 @pytest.mark.unit

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from experiments.reports.production import Cell
-from experiments.reports.studies import STUDIES, Subject, kind_of, paper_point
+from experiments.reports.studies import kind_of, paper_point
 from experiments.tasks.grid_world import TASK
 from jaxnew.run import Question
 from jaxnew.task.places import UsageError
@@ -32,7 +32,7 @@ def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> N
     analysed = Cell("ours", "hvae-oracle", variant="-analysis")
     group = group_of(source, analysed)
     kind = kind_of(study, group.task)
-    points = {value: paper_point(kind, group, value) for value in kind.values(group.task)}
+    points = {value: paper_point(kind, group, value) for value in kind.values}
     assert [100 * points[value].mean for value in sorted(points)] == pytest.approx(means, abs=0.06)
     assert {point.num_seeds for point in points.values()} == {5}
     assert paper_point(kind, group, 0.123) is None
@@ -42,15 +42,15 @@ def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> N
         replace(analysed, variant="-no-subgoals-analysis"),
     ):
         other = group_of(source, cell)
-        value = kind.values(other.task)[0]
+        value = kind.values[0]
         kind_of_other = kind_of(study, other.task)
         assert paper_point(kind_of_other, other, value) is None, cell
 
 
 @pytest.mark.golden
 def test_points_of_the_set_sizes(tmp_path: Path) -> None:
-    kind = STUDIES["set-size"]
     source = source_of("create-push", tmp_path)
+    kind = kind_of("set-size", source.domain.task)
     # 10 and 60 actions.
     for method, first, last in (("ours", 45.3, 81.8), ("no-subsampling", 23.1, 41.0)):
         group = group_of(source, Cell(method, "hvae"))
@@ -62,18 +62,17 @@ def test_points_of_the_set_sizes(tmp_path: Path) -> None:
 
 @pytest.mark.unit
 def test_conditions_of_the_default_axes() -> None:
-    assert list(STUDIES["set-size"].values(TASK)) == [float(n) for n in range(10, 61, 5)]
-    assert list(STUDIES["growing-set"].values(TASK)) == [5.0, 10.0, 25.0, 50.0]
-    assert list(STUDIES["recordings"].values(TASK)) == [1024, 64, 16, 4, 1]
+    assert list(kind_of("set-size", TASK).values) == [float(n) for n in range(10, 61, 5)]
+    assert list(kind_of("growing-set", TASK).values) == [5.0, 10.0, 25.0, 50.0]
+    assert list(kind_of("recordings", TASK).values) == [1024, 64, 16, 4, 1]
 
 
 @pytest.mark.unit
 def test_what_a_value_asks_of_a_run(tmp_path: Path) -> None:
     (group,) = groups_at(write_run(tmp_path / "run", plain_config()))
-    subject = Subject(group.runs[0], group.task)
 
     def asked(name: str, value: float) -> Question:
-        return kind_of(name, group.task).asked(subject, value).question
+        return kind_of(name, group.task).asked(group.runs[0], value).question
 
     assert asked("set-size", 10) == Question("test", 10)
     assert asked("unseen-ratio", 0.4) == Question("unseen-0.4", 50)
