@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
 
-.PHONY: demo test test-slow lint types bench clean
+.PHONY: demo test test-slow lint types docs bench clean
 
 demo: $(INSTALLED)
 	$(BIN)/python -m experiments.demo
@@ -20,6 +20,10 @@ lint: $(INSTALLED)
 
 types: $(INSTALLED)
 	$(BIN)/mypy
+
+# Pages of the commands; a test says when they are stale.
+docs: $(INSTALLED)
+	$(BIN)/python -m experiments.command_pages
 
 bench: $(INSTALLED)
 	$(BIN)/python -m experiments.benchmarks.run

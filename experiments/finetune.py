@@ -11,7 +11,6 @@ everything is kept; from a discrete policy all but its categorical heads. `--scr
 from __future__ import annotations
 
 from experiments.flags import Arguments
-from jaxnew.run import Run
 from jaxnew.task.places import UsageError
 from jaxnew.training import finetune
 
@@ -24,7 +23,7 @@ def main() -> None:
     if ARGUMENTS.run is None:
         raise UsageError("Say which run to fine-tune: --run=DIRECTORY.")
     finetune(
-        Run.load(ARGUMENTS.run, num_workers=ARGUMENTS.workers),
+        ARGUMENTS.run,
         is_scratch=ARGUMENTS.scratch,
         budget=ARGUMENTS.budget,
         seed=ARGUMENTS.seed,

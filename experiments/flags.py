@@ -76,7 +76,7 @@ class Arguments:
     def __init__(self, doc: str, *shared: str) -> None:
         self._doc = doc
         self._values = flags.FlagValues()
-        self._names: list[str] = []
+        self._texts: dict[str, str] = {}
         for name in shared:
             kind, default, text = _SHARED[name]
             limits = {"lower_bound": _AT_LEAST[name]} if name in _AT_LEAST else {}
@@ -88,9 +88,10 @@ class Arguments:
         make: Any = getattr(flags, f"DEFINE_{kind}")
         if kind == "enum":
             make(name, default, options["choices"], text, flag_values=self._values)
+            text = f"{', '.join(options['choices'])}. {text}"
         else:
             make(name, default, text, flag_values=self._values, **options)
-        self._names.append(name)
+        self._texts[name] = f"{text} Repeatable." if kind == "multi_string" else text
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._values, name)
@@ -131,7 +132,7 @@ class Arguments:
         Raises:
           UsageError: it has something that is no flag of this command, or a value is illegal.
         """
-        for name in self._names:
+        for name in self._texts:
             self._values[name].unparse()
         everything = flags.FlagValues()
         everything.append_flag_values(self._values)
@@ -148,11 +149,11 @@ class Arguments:
     def help_text(self, with_absl: bool = False) -> str:
         """What `--help` shows, and `--helpfull`."""
         lines = [self._doc.strip(), "", "Flags:"]
-        for name in self._names:
-            flag = self._values[name]
-            default = "" if flag.default in (None, []) else f" Default: {_shown(flag.default)}."
-            text = textwrap.wrap(f"{flag.help}{default}", 94)
-            lines += [f"  --{name}", *(f"      {line}" for line in text)]
+        for name, text in self._texts.items():
+            found = self._values[name].default
+            default = "" if found in (None, []) else f" Default: {_shown(found)}."
+            wrapped = textwrap.wrap(f"{text}{default}", 94)
+            lines += [f"  --{name}", *(f"      {line}" for line in wrapped)]
         if with_absl:
             lines += ["", "Flags of absl:", _of_absl().get_help("  ")]
         return "\n".join(lines)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib
 import os
 import sys
@@ -28,7 +29,10 @@ def main() -> None:
     """Runs the command that the first argument names."""
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h", "help"):
-        print(f"jaxnew COMMAND [--flag=value ...]\n\nCommands: {', '.join(COMMANDS)}.")
+        print("jaxnew COMMAND [--flag=value ...]\n")
+        for command in COMMANDS:
+            print(f"  {command:16}{summary(command)}")
+        print("\njaxnew COMMAND --help lists the flags of a command.")
         return
     if name not in COMMANDS:
         sys.exit(f"Unknown command {name!r}; there are {', '.join(COMMANDS)}.")
@@ -37,6 +41,12 @@ def main() -> None:
     module = importlib.import_module(f"experiments.{name}")
     sys.argv = [f"jaxnew {name}", *arguments]
     module.ARGUMENTS.start(module.main)
+
+
+def summary(name: str) -> str:
+    """What a command does, in one line; nothing is imported for it."""
+    source = Path(__file__).with_name(f"{name}.py").read_text()
+    return (ast.get_docstring(ast.parse(source)) or "").partition("\n")[0]
 
 
 def child(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:

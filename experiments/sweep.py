@@ -34,7 +34,7 @@ ARGUMENTS = Arguments(
     "set",
 )
 ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71"], "Seeds of the members.")
-ARGUMENTS.define("multi_string", "vary", [], "hyperparameter=value,value,... (repeatable).")
+ARGUMENTS.define("multi_string", "vary", [], "hyperparameter=value,value,...")
 ARGUMENTS.define(
     "integer",
     "members_at_once",

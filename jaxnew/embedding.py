@@ -26,6 +26,7 @@ from jaxnew.representation.table import RepresentationTable, engineered_table, r
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
 from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.budgets import StageOneBudget
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
@@ -319,70 +320,96 @@ def embed(
     """
     task = load_task(task) if isinstance(task, str) else task
     domain = Domain.of(task, split, split_seed)
-    kind, play, modality = parse_representation(domain, representation)
-    preset = domain.stage_one(play, budget)
+    learned = parse_representation(domain, representation)
+    preset = domain.stage_one(learned.play, budget)
     recordings = collect(
         domain,
         runs,
         num_recordings or preset.num_recordings,
-        play,
+        learned.play,
         preset.stores_drawn if stores_drawn is None else stores_drawn,
     )
-    train_on = "all" if representation.endswith(ORACLE) else "train"
-    config = with_set(
-        EmbedConfig(
-            task=task.actions_name or task.reference,
-            representation=representation,
-            split=domain.split_name,
-            split_seed=split_seed,
-            split_hash=domain.split.hash,
-            observations_hash=recordings.recorded.hash,
-            seed=seed,
-            train_on=train_on,
-            model=preset.config(
-                kind,
-                len(_with_always_available(domain.split, train_on)),
-                len(_with_always_available(Domain.of(task).split, "train")),
-            ),
-        ),
-        set,
-    )
+    base = _config(domain, representation, preset, recordings.recorded.hash, seed)
+    config = with_set(base, set)
     title = f"embed-{representation}-{domain.split_label}-{budget}-{seed}"
     path = Path(workdir) if workdir else domain.actions_folder(Path(runs)) / title
-    learner = RepresentationLearner(config.model, modality)
-    data = recordings.for_training(_with_always_available(domain.split, train_on))
     provenance = {"split_hash": domain.split.hash}
     with RunDirectory.open_or_create(
         path, identity(config), overwrite, provenance, upgrade=upgraded
-    ) as run:
-        is_made = (path / TABLE_FILE).exists()
-        if not is_made:
-            print(f"Training {representation} ({config.model.num_steps} steps; {preset.cost}).")
-        result = loop.run(
-            learner.init(jax.random.key(config.seed), data.shape),
-            lambda state, n: _train_chunk(learner, data, state, n),
-            run,
-            loop.Rhythm(config.model.num_steps, preset.chunk_steps, preset.checkpoint_every),
-            loop.Display(
-                representation,
-                unit="steps",
-                work_per_step=config.model.actions_per_batch * config.model.recordings_per_action,
-                work_unit="trajectories",
-                metrics=("loss", "kl_action"),
-            ),
-        )
-        if not result.was_interrupted and not is_made:
-            domain.split.save(path / SPLIT_FILE)
-            table = RepresentationTable(
-                vectors=learner.encode(result.state, recordings.for_encoding()),
-                ids=recordings.recorded.ids,
-                universe_hash=domain.universe.hash,
-                split_hash=domain.split.hash,
-                source=f"{representation}, {budget}, seed {config.seed}",
-            )
-            table.save(path / TABLE_FILE)
-            run.add_provenance(table_hash=table.hash)
+    ) as directory:
+        source = f"{representation}, {budget}, seed {config.seed}"
+        _train(directory, domain, config, learned.modality, preset, recordings, source)
     return Encoder.load(path, task)
+
+
+def _config(
+    domain: Domain,
+    representation: str,
+    preset: StageOneBudget,
+    observations_hash: str,
+    seed: int,
+) -> EmbedConfig:
+    """The config of a run of a preset, before anything is set."""
+    task, split = domain.task, domain.split
+    train_on = "all" if representation.endswith(ORACLE) else "train"
+    return EmbedConfig(
+        task=task.actions_name or task.reference,
+        representation=representation,
+        split=domain.split_name,
+        split_seed=domain.split_seed,
+        split_hash=split.hash,
+        observations_hash=observations_hash,
+        seed=seed,
+        train_on=train_on,
+        model=preset.config(
+            parse_representation(domain, representation).kind,
+            len(_with_always_available(split, train_on)),
+            len(_with_always_available(Domain.of(task).split, "train")),
+        ),
+    )
+
+
+def _train(
+    directory: RunDirectory,
+    domain: Domain,
+    config: EmbedConfig,
+    modality: Modality,
+    preset: StageOneBudget,
+    recordings: PlayRecordings,
+    source: str,
+) -> None:
+    """Trains from where the directory stands to the end, and then writes the table."""
+    model, name = config.model, config.representation
+    learner = RepresentationLearner(model, modality)
+    data = recordings.for_training(_with_always_available(domain.split, config.train_on))
+    is_made = (directory.path / TABLE_FILE).exists()
+    if not is_made:
+        print(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
+    result = loop.run(
+        learner.init(jax.random.key(config.seed), data.shape),
+        lambda state, n: _train_chunk(learner, data, state, n),
+        directory,
+        loop.Rhythm(model.num_steps, preset.chunk_steps, preset.checkpoint_every),
+        loop.Display(
+            name,
+            unit="steps",
+            work_per_step=model.actions_per_batch * model.recordings_per_action,
+            work_unit="trajectories",
+            metrics=("loss", "kl_action"),
+        ),
+    )
+    if result.was_interrupted or is_made:
+        return
+    domain.split.save(directory.path / SPLIT_FILE)
+    table = RepresentationTable(
+        vectors=learner.encode(result.state, recordings.for_encoding()),
+        ids=recordings.recorded.ids,
+        universe_hash=domain.universe.hash,
+        split_hash=domain.split.hash,
+        source=source,
+    )
+    table.save(directory.path / TABLE_FILE)
+    directory.add_provenance(table_hash=table.hash)
 
 
 def _train_chunk(

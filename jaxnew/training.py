@@ -13,7 +13,7 @@ from jaxnew import loop
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Run
+from jaxnew.run import Run, load_trainer, locate
 from jaxnew.storage.config import Assignments
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageTwoBudget
@@ -124,7 +124,10 @@ def finetune(
       UsageError: the source's method has no such continuation, or there is no such budget.
     """
     if not isinstance(source, Run):
-        source = Run.load(source, num_workers=num_workers)
+        path, _ = locate(Path(source))
+        trainer = load_trainer(RunDirectory.load(path), num_workers)
+        _check_continues(trainer.config)  # Runs that cannot go on may have no best checkpoint.
+        source = Run.of(path, trainer, "best")
     config = with_set(finetune_config(source, budget, is_scratch, seed), set)
     table = source.trainer.table
     title = f"finetune-{'scratch' if is_scratch else 'warm'}-{budget}-{config.seed}"
@@ -231,11 +234,7 @@ def run_updates(
 def finetune_config(source: Run, budget_name: str, is_scratch: bool, seed: int) -> TrainConfig:
     """The config of a run that goes on from `source`; see `finetune`."""
     old, task = source.config, source.task
-    if old.method not in CONTINUED or old.trained_on != "train":
-        raise UsageError(
-            f"A run of --method={old.method} on {old.trained_on} actions cannot be fine-tuned; "
-            f"give one of --method={' or '.join(CONTINUED)}."
-        )
+    _check_continues(old)
     method = CONTINUED[old.method]
     budget = adapted(task.budget(budget_name), method, task, source.split)
     rollout = replace(budget.ppo.rollout, freezes_observation_statistics=not is_scratch)
@@ -251,6 +250,14 @@ def finetune_config(source: Run, budget_name: str, is_scratch: bool, seed: int) 
         trained_on="test",
         start="fresh parameters" if is_scratch else f"{old.method}, seed {old.seed}",
     )
+
+
+def _check_continues(config: TrainConfig) -> None:
+    if config.method not in CONTINUED or config.trained_on != "train":
+        raise UsageError(
+            f"A run of --method={config.method} on {config.trained_on} actions cannot be "
+            f"fine-tuned; give one of --method={' or '.join(CONTINUED)}."
+        )
 
 
 def _warm_start(state: TrainState, source: Run, trainer: Trainer) -> TrainState:

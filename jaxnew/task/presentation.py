@@ -35,7 +35,7 @@ class ActionStudy:
 
 @dataclass(frozen=True)
 class Measured:
-    """Speeds on one core of the machine that `README.md` names; for foretelling durations.
+    """Speeds on one core of the machine that `docs/budgets.md` names; for foretelling durations.
 
     Attributes:
       training: environment steps per second by method; one that is absent is taken as `ours`.

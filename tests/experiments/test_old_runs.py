@@ -1,0 +1,76 @@
+"""Runs of version 0.1.0 load, evaluate, go on, and are told from others.
+
+`run_of_0_1_0.tar.gz` is `experiments.train --representation=gt5 --budget=smoke` of that version with
+its checkpoint of update 2, its metrics up to update 4, and an evaluation of 64 test episodes.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tarfile
+from pathlib import Path
+
+import pytest
+
+from jaxnew.run import Run
+from jaxnew.storage import metrics
+from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.settings import identity
+from tests.experiments.commands import read_json, run
+
+pytestmark = pytest.mark.integration
+
+ARCHIVE = Path(__file__).with_name("run_of_0_1_0.tar.gz")
+
+
+@pytest.fixture
+def old(tmp_path: Path) -> Path:
+    """The run's directory, whose latest checkpoint is that of update 2."""
+    with tarfile.open(ARCHIVE) as archive:
+        archive.extractall(tmp_path, filter="data")
+    checkpoints = tmp_path / "run" / "checkpoints"
+    shutil.copytree(checkpoints / "best", checkpoints / "latest")
+    return tmp_path / "run"
+
+
+def test_it_is_loaded_and_evaluated_as_it_was(old: Path) -> None:
+    before = read_json(old / "evaluation" / "test-best-sampled-m50.json")
+    with Run.load(old) as found:
+        row = found.evaluate("test", episodes=64, record=False).rows["test"]
+    assert (found.step, found.config.sets.size, found.config.ppo.rollout.num_envs) == (2, 50, 8)
+    assert row["metrics"].keys() == before["metrics"].keys()
+    for name, was in before["metrics"].items():
+        value = row["metrics"][name]
+        assert value["interval"] == was["interval"], name
+        for part in ("mean", "low", "high"):
+            # Wilson intervals come from SciPy now, and other processors round otherwise.
+            assert value[part] == pytest.approx(was[part], rel=1e-4, abs=1e-9), name
+
+
+def test_it_goes_on(old: Path) -> None:
+    before = metrics.read(old)
+    flags = ("--representation=gt5", "--budget=smoke", f"--workdir={old}")
+    output = run("train", *flags)
+    assert "at step 2 of 4" in output
+    after = metrics.read(old)
+    assert [line["step"] for line in after] == [line["step"] for line in before] == [2, 2, 4, 4]
+    for was, found in zip(before, after, strict=True):
+        timeless = {name for name in was if not name.startswith("time/")}
+        assert timeless == {name for name in found if not name.startswith("time/")}
+        for name in timeless:
+            # Small probability ratios are differences of rounding errors.
+            assert found[name] == pytest.approx(was[name], rel=1e-2, abs=1e-6), name
+
+
+def test_another_run_is_not_taken_for_it(old: Path) -> None:
+    output = run(
+        "train",
+        "--representation=gt5",
+        "--budget=smoke",
+        "--set=sets.size=40",
+        f"--workdir={old}",
+        fails=True,
+    )
+    assert "sets.size: 50 recorded, 40 asked for" in output
+    assert "environment" not in output
+    assert identity(Run.load(old).config) != RunDirectory.load(old).config, "it is left as it was"
