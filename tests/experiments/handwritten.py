@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import numpy as np
 from envs_mjx.grid_world import skill_universe
 from experiments.reports.anchors import Anchors
 from experiments.reports.production import Cell, Source
-from experiments.reports.runs import Group, group_runs, read_runs
+from experiments.reports.runs import Group, RunRecord, group_runs, read_runs
 from experiments.tasks.grid_world import TASK
 from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
@@ -110,9 +111,15 @@ def groups_at(*paths: Path) -> list[Group]:
 # ---- Runs of the cells of figures ----
 
 
+@cache
+def domain_of(task: str) -> Domain:
+    return Domain.of(load_task(task))
+
+
 def source_of(task: str, folder: Path = Path("runs"), **changes: Any) -> Source:
-    domain = Domain.of(load_task(task))
-    return replace(Source(domain, folder, "smoke", "smoke", 0.0, (1, 2), (), {}), **changes)
+    return replace(
+        Source(domain_of(task), folder, "smoke", "smoke", 0.0, (1, 2), (), {}), **changes
+    )
 
 
 def config_of(source: Source, cell: Cell, seed: int = 1) -> dict[str, Any]:
@@ -138,6 +145,12 @@ def group_of(source: Source, cell: Cell, **written: Any) -> Group:
     """The group of one run of a cell."""
     path = finished(source, cell, **written)
     return Group(cell.label, source.of(cell).domain.task, tuple(read_runs([path])))
+
+
+def unwritten(source: Source, cell: Cell) -> Group:
+    """The same with nothing on disk, for what its config tells."""
+    run = RunRecord(Path("nowhere"), config_of(source, cell))
+    return Group(cell.label, source.of(cell).domain.task, (run,))
 
 
 # ---- Policies that know nothing ----

@@ -25,6 +25,12 @@ from tests.experiments import commands
 from tests.experiments.handwritten import plain_config, write_evaluation, write_run
 
 
+def call(*flags: str) -> None:
+    """The command in this process."""
+    figures.ARGUMENTS.parse(list(flags))
+    figures.main()
+
+
 @pytest.mark.integration
 def test_figures_of_run_directories(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -65,7 +71,7 @@ def test_nothing_evaluated_leaves_out_the_bars_and_says_so(
 
 
 @pytest.mark.integration
-def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
+def test_command_draws_a_run_of_embed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = {
         "task": "grid_world",
         "representation": "gt12",
@@ -74,15 +80,10 @@ def test_command_draws_a_run_of_embed(tmp_path: Path) -> None:
         "model": {},
     }
     run = write_run(tmp_path / "embed", config)
-    files = commands.run("figures", f"--run={run}").split()
+    call(f"--run={run}")
+    files = capsys.readouterr().out.split()
     assert files == [str(run / "figures" / f"tsne_{part}.png") for part in drawing.TSNE_PARTS]
     assert all(Image.open(file).size == (920, 960) for file in files)
-
-
-def call(*flags: str) -> None:
-    """The command in this process."""
-    figures.ARGUMENTS.parse(list(flags))
-    figures.main()
 
 
 @pytest.mark.unit

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from experiments.reports.figure_list import FIGURES
 from experiments.reports.paper import paper_method, paper_value
 from experiments.reports.production import Cell
-from tests.experiments.handwritten import group_of, source_of
+from tests.experiments.handwritten import source_of, unwritten
 
 OURS = Cell("ours", "hvae")
 NO_SUBGOALS = Cell("ours", "hvae", variant="-no-subgoals")
@@ -45,9 +43,9 @@ TASK = "shape_stacking"
     ids=lambda value: value.label if isinstance(value, Cell) else None,
 )
 def test_bars_stand_beside_their_rows(
-    tmp_path: Path, task: str, cell: Cell, train: float | None, test: float | None
+    task: str, cell: Cell, train: float | None, test: float | None
 ) -> None:
-    group = group_of(source_of(task, tmp_path), cell)
+    group = unwritten(source_of(task), cell)
     found = []
     for split in ("train", "test"):
         value = None
@@ -82,9 +80,9 @@ def test_bars_stand_beside_their_rows(
     ids=lambda value: value.label if isinstance(value, Cell) else None,
 )
 def test_heights_stand_beside_their_rows(
-    tmp_path: Path, cell: Cell, train: float | None, test: float | None
+    cell: Cell, train: float | None, test: float | None
 ) -> None:
-    group = group_of(source_of(TASK, tmp_path), cell)
+    group = unwritten(source_of(TASK), cell)
     found = []
     for split in ("train", "test"):
         value = None
@@ -96,13 +94,13 @@ def test_heights_stand_beside_their_rows(
 
 
 @pytest.mark.unit
-def test_every_bar_of_the_paper_is_found(tmp_path: Path) -> None:
+def test_every_bar_of_the_paper_is_found() -> None:
     lacking = []
     for number, figure in FIGURES.items():
         for task, cells in figure.cells.items():
             if figure.kind == "bars" and task.startswith("create-"):
-                for place, cell in enumerate(cells):
-                    group = group_of(source_of(task, tmp_path / number / str(place)), cell)
+                for cell in cells:
+                    group = unwritten(source_of(task), cell)
                     arguments = str(group.paper_environment), str(group.paper_method), "test"
                     if paper_value(*arguments, group.paper_figure) is None:
                         lacking.append((number, task, cell.representation))

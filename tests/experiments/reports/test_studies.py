@@ -12,7 +12,7 @@ from experiments.reports.studies import kind_of, paper_point
 from experiments.tasks.grid_world import TASK
 from jaxnew.run import Question
 from jaxnew.task.places import UsageError
-from tests.experiments.handwritten import group_of, groups_at, plain_config, source_of, write_run
+from tests.experiments.handwritten import groups_at, plain_config, source_of, unwritten, write_run
 
 FULL = Cell("ours", "hvae", split="full")
 
@@ -27,10 +27,10 @@ FULL = Cell("ours", "hvae", split="full")
         ("mix", [93.6, 90.2, 85.6, 77.3, 71.8]),
     ],
 )
-def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> None:
-    source = source_of("create-obstacle", tmp_path)
+def test_points_of_figure_9(study: str, means: list[float]) -> None:
+    source = source_of("create-obstacle")
     analysed = Cell("ours", "hvae-oracle", variant="-analysis")
-    group = group_of(source, analysed)
+    group = unwritten(source, analysed)
     kind = kind_of(study, group.task)
     points = {value: paper_point(kind, group, value) for value in kind.values}
     assert [100 * points[value].mean for value in sorted(points)] == pytest.approx(means, abs=0.06)
@@ -41,23 +41,23 @@ def test_points_of_figure_9(tmp_path: Path, study: str, means: list[float]) -> N
         replace(analysed, conditions_position=True),
         replace(analysed, variant="-no-subgoals-analysis"),
     ):
-        other = group_of(source, cell)
+        other = unwritten(source, cell)
         value = kind.values[0]
         kind_of_other = kind_of(study, other.task)
         assert paper_point(kind_of_other, other, value) is None, cell
 
 
 @pytest.mark.golden
-def test_points_of_the_set_sizes(tmp_path: Path) -> None:
-    source = source_of("create-push", tmp_path)
+def test_points_of_the_set_sizes() -> None:
+    source = source_of("create-push")
     kind = kind_of("set-size", source.domain.task)
     # 10 and 60 actions.
     for method, first, last in (("ours", 45.3, 81.8), ("no-subsampling", 23.1, 41.0)):
-        group = group_of(source, Cell(method, "hvae"))
+        group = unwritten(source, Cell(method, "hvae"))
         means = [100 * paper_point(kind, group, size).mean for size in (10, 60)]
         assert means == pytest.approx([first, last], abs=0.06)
     assert paper_point(kind, group, 12) is None
-    assert paper_point(kind, group_of(source, FULL), 10) is None
+    assert paper_point(kind, unwritten(source, FULL), 10) is None
 
 
 @pytest.mark.unit
