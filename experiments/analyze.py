@@ -18,55 +18,74 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from absl import flags
-
-from experiments.pipeline import flags as flag
+from experiments.flags import Arguments
+from experiments.reports.production import Cell, Source
 from experiments.reports.searches import GRIDS, search
-from experiments.reports.studies import STUDIES, study_runs
-from experiments.reports.study_report import Study, write_study
+from experiments.reports.studies import NAMES, study_runs
+from experiments.reports.study_report import write_study
+from jaxnew.task.places import UsageError
 
-STUDY = flags.DEFINE_string(
-    "study", None, f"What to study: {', '.join([*STUDIES, *GRIDS])}, or one of the task's own."
+ARGUMENTS = Arguments(
+    __doc__,
+    "task",
+    "method",
+    "representation",
+    "representation_budget",
+    "split",
+    "split_seed",
+    "budget",
+    "runs",
+    "workers",
+    "set",
 )
-RUN = flags.DEFINE_list("run", [], "Runs of train or sweep to evaluate.")
-ENCODER = flags.DEFINE_string("encoder", None, "Run of embed, for --study=recordings.")
-VALUES = flags.DEFINE_list("values", [], "Values of the horizontal axis; default: the study's.")
-EPISODES = flags.DEFINE_integer("episodes", 5000, "Episodes of each evaluation.")
-SEEDS = flags.DEFINE_list("seeds", ["31", "41", "51", "61", "71", "81"], "Seeds of a search.")
-STEPS = flags.DEFINE_float("steps", 0.0, "Environment steps of a search's runs; 0: of --budget.")
-DRY_RUN = flags.DEFINE_bool("dry_run", False, "Of a search, only say what is missing.")
-REPRESENTATION_BUDGET = flags.DEFINE_string(
-    "representation_budget", None, "Budget of a search's representation; default: --budget."
+ARGUMENTS.define(
+    "string",
+    "study",
+    None,
+    f"What to study: {', '.join([*NAMES, *GRIDS])}, or one of the task's own.",
 )
-OUT = flags.DEFINE_string("out", None, "Where to write; default: `analysis/` beside the runs.")
+ARGUMENTS.define("list", "run", [], "Runs of train or sweep to evaluate.")
+ARGUMENTS.define("string", "encoder", None, "Run of embed, for --study=recordings.")
+ARGUMENTS.define("list", "values", [], "Values of the horizontal axis; default: the study's.")
+ARGUMENTS.define("integer", "episodes", 5000, "Episodes of each evaluation.")
+ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71", "81"], "Seeds of a search.")
+ARGUMENTS.define("float", "steps", 0.0, "Environment steps of a search's runs; 0: of --budget.")
+ARGUMENTS.define("bool", "dry_run", False, "Of a search, only say what is missing.")
+ARGUMENTS.define("string", "out", None, "Where to write; default: `analysis/` beside the runs.")
+
+_OF_STUDIES = ("run", "encoder", "episodes")
+_OF_SEARCHES = (
+    *("task", "method", "representation", "representation_budget", "split", "split_seed"),
+    *("budget", "runs", "set", "seeds", "steps", "dry_run"),
+)
 
 
 def main() -> None:
-    if STUDY.value is None:
-        raise flag.UsageError(f"Say which: --study={'|'.join([*STUDIES, *GRIDS])}.")
-    if STUDY.value in GRIDS:
-        searched = search(
-            STUDY.value,
-            [int(seed) for seed in SEEDS.value],
-            STEPS.value,
-            [float(value) for value in VALUES.value],
-            REPRESENTATION_BUDGET.value,
-            DRY_RUN.value,
-        )
-        if searched is None:
-            return
-        study: Study = searched
-        folder = Path(flag.RUNS.value) / flag.load_task(flag.TASK.value).name
+    if ARGUMENTS.study is None:
+        raise UsageError(f"Say which: --study={'|'.join([*NAMES, *GRIDS])}.")
+    values = [float(value) for value in ARGUMENTS.values]
+    if ARGUMENTS.study in GRIDS:
+        ARGUMENTS.refuse(_OF_STUDIES, "for a search")
+        cell, own = Cell(ARGUMENTS.method, ARGUMENTS.representation), Source.asked_for(ARGUMENTS)
+        folder = own.domain.folder(own.folder)
+        study = search(ARGUMENTS.study, own, cell, values, ARGUMENTS.dry_run)
     else:
-        paths = [Path(path) for path in RUN.value]
-        encoder = Path(ENCODER.value) if ENCODER.value else None
-        values = [float(value) for value in VALUES.value]
-        study = study_runs(STUDY.value, paths, values, EPISODES.value, encoder, flag.WORKERS.value)
-        folder = paths[0].parent
-    out = Path(OUT.value) if OUT.value else folder / "analysis"
-    for file in write_study(study, out, study.name.replace("-", "_")):
-        print(file)
+        ARGUMENTS.refuse(_OF_SEARCHES, "for a study of runs")
+        paths = [Path(path) for path in ARGUMENTS.run]
+        folder = Path(*paths[:1]).parent
+        study = study_runs(
+            ARGUMENTS.study,
+            paths,
+            values,
+            ARGUMENTS.episodes,
+            Path(ARGUMENTS.encoder) if ARGUMENTS.encoder else None,
+            ARGUMENTS.workers,
+        )
+    if study is not None:
+        out = Path(ARGUMENTS.out) if ARGUMENTS.out else folder / "analysis"
+        for file in write_study(study, out, study.name.replace("-", "_")):
+            print(file)
 
 
 if __name__ == "__main__":
-    flag.run_command(main)
+    ARGUMENTS.start(main)

@@ -12,7 +12,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-from absl import flags
 from PIL import Image, ImageDraw, ImageFont
 
 from envs_host.create.building import build_tool
@@ -25,7 +24,10 @@ from envs_host.create.levels import load_level
 from envs_host.create.levels.registry import BUILT_IN_NAMES
 from envs_host.create.sprites import Sprite
 from envs_host.create.tools import Tool, ToolClass, all_tools
-from experiments.pipeline import flags as flag
+from experiments.flags import Arguments
+
+ARGUMENTS = Arguments(__doc__)
+ARGUMENTS.define("string", "out", "results/create", "Folder of the two pictures.")
 
 SMOKE_LEVEL = "GoalTest"
 NUM_EXAMPLES = 3
@@ -38,12 +40,8 @@ _LARGEST_SHOWN = 26.0  # Units: what fits into a third of the world's width.
 _NUM_COLORS = 200
 
 
-def define_flags() -> None:
-    flags.DEFINE_string("out", "results/create", "Folder of the two pictures.")
-
-
 def main() -> None:
-    out = Path(flags.FLAGS.out)
+    out = Path(ARGUMENTS.out)
     out.mkdir(parents=True, exist_ok=True)
     for name, sheet in (("levels", levels_sheet()), ("tools", tools_sheet())):
         path = out / f"{name}.png"
@@ -151,5 +149,4 @@ def _sheet(cells: Sequence[tuple[str, str, np.ndarray]], columns: int) -> Image.
 
 
 if __name__ == "__main__":
-    define_flags()
-    flag.run_command(main)
+    ARGUMENTS.start(main)

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from experiments import figures
 from experiments.embed import print_report
 from experiments.flags import Arguments
+from experiments.reports.films import animate_run
 from experiments.reports.paper import paper_value
 from jaxnew.embedding import embed
 from jaxnew.rollout.contract import Policy
@@ -45,7 +46,7 @@ def main() -> None:
     print_success(run, task.budget(budget).final_episodes)
     for file in figures.make_figures([run.path], run.path / "figures"):
         print(f"  {file}")
-    figures.episode_animation(run.path, run.path / "figures" / "zero_shot_episode.gif")
+    animate_run(run.path, run.path / "figures" / "zero_shot_episode.gif")
     print(f"{(time.perf_counter() - start) / 60:.1f} minutes. Everything is in {run.path}.")
 
 

@@ -2,8 +2,8 @@
 
     python -m experiments.figures --run=RUN,RUN,RUN --out=DIRECTORY
     python -m experiments.figures --figure=4,6,24 --task=grid_world --budget=paper
-    python -m experiments.figures --figure=8 --task=create-push --run=RUN
-    python -m experiments.figures --figure=8 --task=shape_stacking --run=RUN --film_size=400
+    python -m experiments.figures --figure=8 --run=RUN
+    python -m experiments.figures --figure=8 --run=RUN --film_size=400 --film_pages
 
 With `--run`, whatever the directories hold is drawn; nothing is trained or evaluated. Runs that
 differ in their seed only are drawn as one setting; a sweep stands for its members, and a run of
@@ -24,60 +24,124 @@ import shlex
 from collections.abc import Sequence
 from pathlib import Path
 
-from absl import flags
-
-from experiments.pipeline import flags as flag
-from experiments.reports import paper_figures, plots
+from experiments.flags import Arguments
+from experiments.reports import paper_figures, plots, tables
 from experiments.reports.anchors import notes_of
 from experiments.reports.drawing import (
     BAR_SPLITS,
     CURVE_SPLITS,
     bars_figure,
     curves_figure,
-    environment_of,
-    standard_rows,
     tsne_figures,
 )
-from experiments.reports.episode import episode_animation
-from experiments.reports.results import ResultRow, as_csv, as_markdown, result_rows
-from experiments.reports.runs import Group, group_runs, read_runs
+from experiments.reports.figure_list import FIGURES
+from experiments.reports.films import FilmOptions, animate_run, film_run
+from experiments.reports.paper_figures import Options
+from experiments.reports.production import Source
+from experiments.reports.results import as_csv, as_markdown, result_rows
+from experiments.reports.runs import Group, group_runs, policies, read_runs
+from jaxnew.task.domain import load_task
+from jaxnew.task.places import UsageError
 
-__all__ = ["episode_animation", "make_figures"]
+ARGUMENTS = Arguments(
+    __doc__,
+    "task",
+    "split",
+    "split_seed",
+    "budget",
+    "representation_budget",
+    "runs",
+    "workers",
+    "set",
+)
+ARGUMENTS.define("list", "run", [], "Run directories of train, sweep or embed.")
+ARGUMENTS.define(
+    "list", "figure", [], f"Figures of the paper to find or make runs for: {', '.join(FIGURES)}."
+)
+ARGUMENTS.define("string", "out", None, "Where to write; default: `figures/` of the one run.")
+ARGUMENTS.define("bool", "pdf", False, "Also write every figure as PDF.")
+ARGUMENTS.define("bool", "episode", False, "Also film a zero-shot episode of a run as a GIF.")
+ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71"], "Seeds of the policies.")
+ARGUMENTS.define("float", "steps", 0.0, "Environment steps of each run; 0: those of --budget.")
+ARGUMENTS.define("float", "finetune_steps", 0.0, "The same of fine-tuning.")
+ARGUMENTS.define("integer", "episodes", 5000, "Episodes of each evaluation.")
+ARGUMENTS.define(
+    "multi_string",
+    "given",
+    [],
+    "NAME=PATH: a table (.npz) or run of embed to take for a representation; NAME@SPLIT=PATH or "
+    "NAME@VARIANT=PATH where a figure has one of another split or of other actions (7a, 15: "
+    "hvae@full; 9a-c: hvae-oracle@analysis).",
+)
+ARGUMENTS.define("bool", "dry_run", False, "Only say what is missing and how long it takes.")
+ARGUMENTS.define("integer", "films", 20, "Episodes that figure 8 shows.", lower_bound=1)
+ARGUMENTS.define("integer", "film_size", 512, "Pixels of their side.", lower_bound=16)
+ARGUMENTS.define(
+    "enum", "film_format", "gif", "Of their files; mp4: jaxnew[video].", choices=["gif", "mp4"]
+)
+ARGUMENTS.define("bool", "film_pages", False, "Interactive pages as well, of stacking; needs Brax.")
 
-
-def define_flags() -> None:
-    """Flags of the command; not at import, since `demo` imports this beside other commands."""
-    flags.DEFINE_list("run", [], "Run directories of train, sweep or embed.")
-    flags.DEFINE_string("out", None, "Where to write; default: `figures/` of the one run.")
-    flags.DEFINE_bool("pdf", False, "Also write every figure as PDF.")
-    flags.DEFINE_bool("episode", False, "Also play a zero-shot episode and write it as a GIF.")
-    paper_figures.define_flags()
+# Flags that are about runs yet to be made.
+_PRODUCTION = (
+    *("split", "split_seed", "budget", "representation_budget", "runs", "set", "seeds", "steps"),
+    *("finetune_steps", "episodes", "given", "dry_run"),
+)
 
 
 def main() -> None:
-    values = flags.FLAGS
-    if values.figure == ["8"] and values.run:
-        for file in paper_figures.film_given(values):
-            print(file)
-        return
-    if values.figure and values.run:
-        raise flag.UsageError("Give --run, to draw these runs, or --figure, to find and make them.")
-    if values.figure:
-        for file in paper_figures.make(values):
-            print(file)
-        return
-    paths = [Path(path) for path in values.run]
-    if not values.out and len(paths) > 1:
-        raise flag.UsageError("Several runs: say where their figures go with --out=DIRECTORY.")
-    out = Path(values.out) if values.out else Path(values.run[0] if paths else ".") / "figures"
-    files = make_figures(paths, out, pdf=values.pdf)
-    if values.episode:
-        policies = [run for run in read_runs(paths) if run.is_policy]
-        if not policies:
-            raise flag.UsageError("--episode needs a run of train; the runs given are of embed.")
-        files += episode_animation(policies[0].path, out / "zero_shot_episode.gif")
+    paths = [Path(path) for path in ARGUMENTS.run]
+    if ARGUMENTS.figure and paths and ARGUMENTS.figure != ["8"]:
+        raise UsageError("Give --run, to draw these runs, or --figure, to find and make them.")
+    if ARGUMENTS.figure and paths:
+        files = film_given(paths)
+    elif ARGUMENTS.figure:
+        ARGUMENTS.refuse(("episode",), "with --figure")
+        out = Path(ARGUMENTS.out) if ARGUMENTS.out else None
+        source = Source.asked_for(ARGUMENTS, paper_figures.parse_given(ARGUMENTS.given))
+        files = paper_figures.make(ARGUMENTS.figure, source, options(), out, ARGUMENTS.dry_run)
+    else:
+        files = draw_given(paths)
     for file in files:
         print(file)
+
+
+def options() -> Options:
+    """What is asked of the paper's figures."""
+    suffix = f".{ARGUMENTS.film_format}"
+    films = FilmOptions(ARGUMENTS.films, ARGUMENTS.film_size, suffix, ARGUMENTS.film_pages)
+    return Options(ARGUMENTS.episodes, ARGUMENTS.finetune_steps, ARGUMENTS.pdf, films)
+
+
+def film_given(paths: Sequence[Path]) -> list[Path]:
+    """Figure 8 of a run that is given.
+
+    Raises:
+      UsageError: several are given, or it is no run of a policy, or of another task than `--task`.
+    """
+    ARGUMENTS.refuse(("episode", "pdf", *_PRODUCTION), "with --figure=8 --run")
+    runs = policies(paths)
+    if len(runs) != 1:
+        raise UsageError(f"Figure 8 shows one run; {len(runs)} were given.")
+    (group,) = group_runs(runs)
+    if ARGUMENTS.is_given("task") and load_task(ARGUMENTS.task).reference != group.task.reference:
+        raise UsageError(f"{runs[0].path} is a run of {group.task.name}, not of {ARGUMENTS.task}.")
+    out = Path(ARGUMENTS.out) if ARGUMENTS.out else runs[0].path / "figures"
+    title = f"Figure 8, {group.place}: {group.label}"
+    return film_run(runs[0].path, out / "figure_8", title, options().films, ARGUMENTS.workers)
+
+
+def draw_given(paths: Sequence[Path]) -> list[Path]:
+    """All figures of runs that are given."""
+    films = ("films", "film_size", "film_format", "film_pages")
+    ARGUMENTS.refuse(("task", "workers", *films, *_PRODUCTION), "without --figure")
+    if not ARGUMENTS.out and len(paths) > 1:
+        raise UsageError("Several runs: say where their figures go with --out=DIRECTORY.")
+    out = Path(ARGUMENTS.out) if ARGUMENTS.out else Path(*paths[:1]) / "figures"
+    animated = policies(paths)[0].path if ARGUMENTS.episode else None
+    files = make_figures(paths, out, ARGUMENTS.pdf)
+    if animated is not None:
+        files += animate_run(animated, out / "zero_shot_episode.gif")
+    return files
 
 
 def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> list[Path]:
@@ -98,13 +162,12 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
     runs = read_runs(run_paths)
     tasks = {run.config["task"] for run in runs}
     if len(tasks) > 1:
-        raise flag.UsageError(f"The runs are of several tasks, {sorted(tasks)}; draw one a time.")
+        raise UsageError(f"The runs are of several tasks, {sorted(tasks)}; draw one a time.")
     groups = group_runs([run for run in runs if run.is_policy])
-    out.mkdir(parents=True, exist_ok=True)
     written = []
     if groups:
         rows = {group.label: result_rows(group) for group in groups}
-        notes = [*missing_curves(groups), *missing_evaluations(groups, rows)]
+        notes = [note for group in groups for note in missing_from(group)]
         for note in notes:
             print(note)
         for name, figure in (
@@ -113,58 +176,33 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
         ):
             if figure is not None:
                 written += plots.save(figure, out / f"{name}.png", pdf)
-        written += write_table(groups, rows, out, notes)
+        flat = [row for of_group in rows.values() for row in of_group]
+        notes += notes_of(groups)
+        text = as_markdown(groups[0].place, flat, groups[0].metric, notes)
+        written += tables.write(out, "results", text, as_csv(flat))
     for name, figure in tsne_figures(runs):
         written += plots.save(figure, out / f"{name}.png", pdf)
     return written
 
 
-def missing_curves(groups: Sequence[Group]) -> list[str]:
-    """A line for each run without any evaluation during training."""
-    return [
-        f"{run.path} has no evaluations in its metrics.jsonl yet, so no learning curve."
-        for group in groups
-        for run in group.runs
-        if not any(len(run.curve(f"{s}/{group.task.selection_metric}")[0]) for s in CURVE_SPLITS)
-    ]
-
-
-def missing_evaluations(groups: Sequence[Group], rows: dict[str, list[ResultRow]]) -> list[str]:
-    """For each run that lacks an evaluation of the bars, the command that makes it."""
+def missing_from(group: Group) -> list[str]:
+    """A line for each run without any evaluation during training, or without one of the bars."""
     lines = []
-    for group in groups:
-        standard = standard_rows(rows[group.label])
-        for run in group.runs:
-            lacking = [
-                split
-                for split in BAR_SPLITS
-                if split not in standard or str(run.path) not in standard[split].runs
-            ]
-            if lacking:
-                lines.append(
-                    f"{run.path} has no evaluation on {' and '.join(lacking)} actions; make it "
-                    f"with: python -m experiments.evaluate --run={shlex.quote(str(run.path))} "
-                    f"--sets={','.join(lacking)} --episodes=5000"
-                )
+    for run in group.runs:
+        curves = [run.curve(f"{s}/{group.task.selection_metric}")[0] for s in CURVE_SPLITS]
+        if not any(map(len, curves)):
+            lines.append(
+                f"{run.path} has no evaluations in its metrics.jsonl yet, so no learning curve."
+            )
+        lacking = [part for part in BAR_SPLITS if run.answer(group.standard(part)) is None]
+        if lacking:
+            lines.append(
+                f"{run.path} has no evaluation on {' and '.join(lacking)} actions; make it "
+                f"with: python -m experiments.evaluate --run={shlex.quote(str(run.path))} "
+                f"--sets={','.join(lacking)} --episodes=5000"
+            )
     return lines
 
 
-def write_table(
-    groups: Sequence[Group], rows: dict[str, list[ResultRow]], out: Path, notes: Sequence[str]
-) -> list[Path]:
-    """`results.md` and `results.csv`: every evaluation of every group, beside the paper's."""
-    flat = [row for group in groups for row in rows[group.label]]
-    contents = {
-        "results.md": as_markdown(
-            environment_of(groups), flat, groups[0].metric, [*notes, *notes_of(groups)]
-        ),
-        "results.csv": as_csv(flat),
-    }
-    for name, text in contents.items():
-        (out / name).write_text(text, encoding="utf-8")
-    return [out / name for name in contents]
-
-
 if __name__ == "__main__":
-    define_flags()
-    flag.run_command(main)
+    ARGUMENTS.start(main)

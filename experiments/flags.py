@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import textwrap
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -99,6 +99,16 @@ class Arguments:
     def is_given(self, name: str) -> bool:
         """Whether a flag stands on the command line."""
         return bool(self._values[name].present)
+
+    def refuse(self, names: Sequence[str], mode: str) -> None:
+        """Refuses flags that mean nothing in a mode of the command.
+
+        Raises:
+          UsageError: one of them stands on the command line.
+        """
+        given = [f"--{name}" for name in names if self.is_given(name)]
+        if given:
+            raise UsageError(f"{', '.join(given)}: of no meaning {mode}; leave it out.")
 
     @property
     def path(self) -> Path | None:

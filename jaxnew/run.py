@@ -32,6 +32,45 @@ from jaxnew.trainer import Trainer
 
 
 @dataclass(frozen=True)
+class Question:
+    """What an evaluation tells: how a policy does on sets of some actions.
+
+    Attributes:
+      actions: name of what sets are drawn from, such as a part of the split.
+      set_size: m; None for all that there are.
+      first_size, growth: of a set that grows during the episode, see `Actions.first_size`.
+      checkpoint: whose policy.
+      policy: `sampled` or `greedy`.
+    """
+
+    actions: str
+    set_size: int | None
+    first_size: int = 0
+    growth: int = 1
+    checkpoint: str = "best"
+    policy: str = "sampled"
+
+    def is_answered_by(self, evaluation: Mapping[str, Any], episodes: int = 1) -> bool:
+        """Whether an evaluation on record is the one.
+
+        Args:
+          evaluation: what `Run.record` wrote.
+          episodes: it has at least so many, of the seed that all runs share.
+        """
+        size, whole = evaluation["set_size"], evaluation.get("num_actions", float("inf"))
+        first_size = evaluation.get("first_size", 0)
+        return (
+            (evaluation["actions"], evaluation["checkpoint"], evaluation["policy"])
+            == (self.actions, self.checkpoint, self.policy)
+            and (size >= whole if self.set_size is None else size == self.set_size)
+            and first_size == self.first_size
+            and (not first_size or evaluation["growth"] == self.growth)
+            and evaluation["num_episodes"] >= episodes
+            and evaluation.get("evaluation_seed", EVALUATION_SEED) == EVALUATION_SEED
+        )
+
+
+@dataclass(frozen=True)
 class Evaluation:
     """Numbers of one checkpoint, by list of actions; prints as a table.
 

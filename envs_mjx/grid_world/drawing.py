@@ -1,11 +1,10 @@
-"""Pictures and videos of Grid World, with Pillow only."""
+"""Pictures of Grid World, with Pillow only."""
 
 from __future__ import annotations
 
 import itertools
 from collections.abc import Sequence
 from functools import lru_cache
-from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -116,7 +115,7 @@ def draw_episode(
       pixels: side of the grid, see `draw_state`.
 
     Returns:
-      Frames uint8[height, width, 3], for `animate_episode`.
+      Frames uint8[height, width, 3].
 
     Raises:
       ValueError: the three lengths do not belong together.
@@ -149,35 +148,18 @@ def draw_episode(
     return frames
 
 
-def animate_episode(
-    frames: Sequence[np.ndarray], path: str | Path, frame_ms: int = 220, last_ms: int = 1500
-) -> None:
-    """Writes frames as an endless GIF.
-
-    Args:
-      frames: uint8[height, width, 3] each, all of one size, at least one.
-      path: the file; its folder must exist.
-      frame_ms, last_ms: milliseconds that each frame and the last one stay.
-
-    Raises:
-      ValueError: there is no frame.
-    """
-    if not frames:
-        raise ValueError("An animation needs at least one frame.")
-    # One palette for all frames, so that colours do not flicker.
-    palette = Image.fromarray(np.concatenate([frames[0], frames[-1]])).quantize(128)
-    images = [
-        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
-        for frame in frames
-    ]
-    images[0].save(
-        path,
-        format="GIF",
-        save_all=True,
-        append_images=images[1:],
-        duration=[frame_ms] * (len(images) - 1) + [last_ms],
-        loop=0,
-    )
+def draw_way(
+    states: Sequence[GridWorldState],
+    skill_ids: Sequence[int],
+    rewards: Sequence[float],
+    pixels: int,
+) -> np.ndarray:
+    """The whole path of an episode over its last state; arguments as of `draw_episode`."""
+    cells = [(int(x), int(y)) for x, y in [states[0].agent_xy]]
+    for before, after, skill_id in zip(states[:-1], states[1:], skill_ids, strict=True):
+        cells += list(skill_path(before, after, skill_id))[1:]
+    caption = f"{len(skill_ids)} skills, {int(states[-1].num_moves)} moves"
+    return draw_state(states[-1], cells, pixels, caption, f"return {sum(rewards):.3f}")
 
 
 def _note(state: GridWorldState, total: float) -> str:

@@ -31,49 +31,29 @@ _STILL_TURN = 0.02  # Of a quaternion's numbers; half the angle, rad.
 _EXACT = "mujoco_c"
 
 
-def draw_episode(
-    env: ShapeStacking,
-    states: Sequence[StackingState],
-    actions: Sequence[Action],
-    rewards: Sequence[float],
-    *,
-    size: int = 400,
-) -> list[np.ndarray]:
-    """The pictures of one episode, with shadows, from where the task's camera stands.
+def draw(env: ShapeStacking, shown: Sequence[Bodies], size: int = 400) -> list[np.ndarray]:
+    """The pictures of an episode, with shadows, from where the task's camera stands.
 
     Args:
       env: where it was played.
-      states: T + 1 states: the start and what `step_env` returned after each action.
-      actions: T actions.
-      rewards: not shown.
+      shown: the moments of `seen`.
       size: pixels of a side.
 
     Returns:
-      Frames uint8[size, size, 3]. Times in which nothing moves are left out.
-
-    Raises:
-      ValueError: the numbers of states and actions do not belong together.
+      Frames uint8[size, size, 3].
     """
-    del rewards
     camera = task_camera(env.position_dim)
-    return [draw_bodies(bodies, camera, size) for bodies in seen(env, states, actions)]
+    return [draw_bodies(bodies, camera, size) for bodies in shown]
 
 
-def episode_page(
-    env: ShapeStacking, states: Sequence[StackingState], actions: Sequence[Action]
-) -> str:
-    """The same moments as a page that turns under the mouse; see `viewer.tower_html`.
-
-    Args:
-      env, states, actions: as in `draw_episode`.
+def page(shown: Sequence[Bodies]) -> str:
+    """The moments of `seen` as a page that turns under the mouse; see `viewer.tower_html`.
 
     Raises:
-      ValueError: the numbers of states and actions do not belong together.
       ImportError: Brax is missing.
     """
     from envs_mjx.shape_stacking.viewer import tower_html  # Imports Brax.
 
-    shown = seen(env, states, actions)
     poses = np.stack([np.asarray(bodies.qpos) for bodies in shown])
     return tower_html(shown[-1].shape_ids, poses, FRAME_STEPS * scene.TIMESTEP_S)
 
@@ -84,7 +64,9 @@ def seen(
     """The bodies at every moment that a film of an episode shows.
 
     Args:
-      env, states, actions: as in `draw_episode`.
+      env: where it was played.
+      states: T + 1 states: the start and what `step_env` returned after each action.
+      actions: T actions.
 
     Returns:
       One world each. Times in which nothing moves are left out.

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 
+from experiments.reports import tables
 from experiments.reports.curves import mean_curve
 from experiments.reports.drawing import CURVE_SPLITS, run_curves
 from experiments.reports.paper import is_comparable, paper_curve
@@ -55,28 +54,16 @@ def compare_curves(groups: Sequence[Group]) -> list[CurvePoint]:
             runs = run_curves(group, split)
             if not runs:
                 continue
+            is_fair = is_comparable(group.paper_environment, group.paper_method, split)
             steps, mean, std = mean_curve([run.held_at_best() for run in runs])
             for share in _SHARES:
                 index = int(np.argmin(np.abs(steps - share * steps[-1])))
-                paper = _paper_at(group, split, steps[index])
                 ours = float(mean[index]), float(std[index])
-                points.append(
-                    CurvePoint(
-                        group.label,
-                        split,
-                        float(steps[index]),
-                        *ours,
-                        len(runs),
-                        *paper,
-                        verdict_of(*ours, *paper) if is_fair(group, split) else None,
-                    )
-                )
+                paper = _paper_at(group, split, steps[index])
+                verdict = verdict_of(*ours, *paper) if is_fair else None
+                at = group.label, split, float(steps[index])
+                points.append(CurvePoint(*at, *ours, len(runs), *paper, verdict))
     return points
-
-
-def is_fair(group: Group, split: str) -> bool:
-    """Whether the paper's curve on this part of the split can be compared with ours."""
-    return is_comparable(group.paper_environment, group.paper_method, split)
 
 
 def _paper_at(group: Group, split: str, steps: float) -> tuple[float | None, float | None]:
@@ -102,31 +89,27 @@ def verdict_of(
 
 def comparison_csv(points: Sequence[CurvePoint]) -> str:
     """The points with all fields."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(CurvePoint)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(asdict(point) for point in points)
-    return text.getvalue()
+    return tables.csv_text([asdict(p) for p in points], [f.name for f in fields(CurvePoint)])
 
 
 def comparison_markdown(
     title: str, points: Sequence[CurvePoint], metric: Metric, note: str = ""
 ) -> str:
     """The points for reading, and a note below them."""
-    lines = [f"# {title}", "", "| setting | sets | steps (million) | ours | paper | ours is |"]
-    lines.append("|" + " --- |" * 6)
+    rows = []
     for point in points:
         ours = f"{metric.text(point.mean)} ± {metric.text(point.std)} ({point.num_seeds} seeds)"
         paper = "-"
         if point.paper_mean is not None and point.paper_std is not None:
             paper = f"{metric.text(point.paper_mean)} ± {metric.text(point.paper_std)}"
         cells = [point.setting, point.split, f"{point.steps * 1e-6:.2f}", ours, paper]
-        lines.append("| " + " | ".join([*cells, point.verdict or "-"]) + " |")
-    lines += [
-        "",
+        rows.append([*cells, point.verdict or "-"])
+    header = ["setting", "sets", "steps (million)", "ours", "paper", "ours is"]
+    lines = [
+        *(f"# {title}", "", *tables.table(header, rows), ""),
         f"{metric.name}; every seed held at its best evaluation so far, as the paper draws its "
         "curves; ± is the population standard deviation over seeds. `on`: the means differ by at "
         "most the root of the summed squares of the two deviations.",
+        *(["", note] if note else []),
     ]
-    lines += ["", note] if note else []
     return "\n".join(lines) + "\n"

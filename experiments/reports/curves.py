@@ -37,7 +37,9 @@ class RunCurve:
     values: np.ndarray
 
     def held_at_best(self) -> RunCurve:
-        """The curve up to its first maximum, and that maximum from there on (spec method 11)."""
+        """The curve up to its first maximum, and that maximum from there on (docs/method.md,
+        "Figures").
+        """
         best = int(np.argmax(self.values)) if len(self.values) else 0
         is_after = np.arange(len(self.values)) > best
         return RunCurve(self.steps, np.where(is_after, self.values[best : best + 1], self.values))
@@ -95,20 +97,24 @@ def learning_curves(
     num_rows = -(-len(labels) // num_columns)
     figure = new_figure(4.6 * len(splits), 3.5 + 0.17 * num_rows)
     panels = figure.subplots(1, len(splits), sharey=True, squeeze=False)[0]
-    ends = [run.steps[-1] for s in settings for c in s.runs.values() for run in c if len(run.steps)]
-    right = max(ends, default=1.0)
-    unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
+    unit = _Unit.of([run for s in settings for runs in s.runs.values() for run in runs], metric)
+    papers = _papers(settings)
     for axes, split in zip(panels, splits, strict=True):
-        papers = _papers(settings)
         for paper in papers:
-            _draw_paper_curve(axes, paper, len(papers) == 1, split, metric, unit, right)
+            if split in paper.paper:
+                color = PAPER_COLOR if len(papers) == 1 else paper.color
+                _draw_paper_curve(axes, paper, paper.paper[split], color, unit)
         for setting in settings:
-            _draw_run_curves(axes, setting, split, metric, unit)
+            runs = [run for run in setting.runs.get(split, ()) if len(run.steps)]
+            for run in runs:
+                x, y = run.steps / unit.steps, metric.scale * run.values
+                faint: dict[str, Any] = {"color": setting.color, "alpha": 0.45, "linewidth": 0.9}
+                axes.plot(x, y, label=f"{setting.label}: run", **faint)
+            if runs:
+                held = [run.held_at_best() for run in runs]
+                _draw_mean(axes, held, setting.color, setting.label, unit)
         axes.set_title(f"{split} actions".capitalize(), fontsize=10, color=INK)
-        axes.set_xlim(0.0, 1.01 * right / unit)
-        axes.set_ylim(0.0, 100.0 if metric.unit == "%" else None)
-        axes.set_xlabel(f"Environment steps ({unit_name})", fontsize=9, color=INK)
-        tidy(axes)
+        unit.finish(axes, "Environment steps")
     panels[0].set_ylabel(metric.name, fontsize=9, color=INK)
     figure.legend(
         handles,
@@ -122,27 +128,43 @@ def learning_curves(
     return figure
 
 
-def _draw_run_curves(
-    axes: Axes, setting: CurveSetting, split: str, metric: Metric, unit: float
-) -> None:
-    runs = [run for run in setting.runs.get(split, ()) if len(run.steps)]
-    if not runs:
-        return
-    for run in runs:
-        axes.plot(
-            run.steps / unit,
-            metric.scale * run.values,
-            color=setting.color,
-            alpha=0.45,
-            linewidth=0.9,
-            label=f"{setting.label}: run",
-        )
-    steps, mean, std = mean_curve([run.held_at_best() for run in runs])
-    x, y, band = steps / unit, metric.scale * mean, metric.scale * std
+@dataclass(frozen=True)
+class _Unit:
+    """Of the axes.
+
+    Attributes:
+      steps, name: of the horizontal one.
+      right: its end, environment steps.
+      metric: of the vertical one.
+    """
+
+    steps: float
+    name: str
+    right: float
+    metric: Metric
+
+    @classmethod
+    def of(cls, runs: Sequence[RunCurve], metric: Metric) -> _Unit:
+        """What the longest of some runs needs."""
+        right = max((run.steps[-1] for run in runs if len(run.steps)), default=1.0)
+        return cls(*((1e6, "million") if right >= 1e6 else (1e3, "thousand")), right, metric)
+
+    def finish(self, axes: Axes, x_label: str) -> None:
+        """Limits and labels of axes."""
+        axes.set_xlim(0.0, 1.01 * self.right / self.steps)
+        axes.set_ylim(0.0, 100.0 if self.metric.unit == "%" else None)
+        axes.set_xlabel(f"{x_label} ({self.name})", fontsize=9, color=INK)
+        tidy(axes)
+
+
+def _draw_mean(axes: Axes, runs: Sequence[RunCurve], color: Color, label: str, unit: _Unit) -> None:
+    """Mean and, of several runs, deviation."""
+    steps, mean, std = mean_curve(runs)
+    x, y, band = steps / unit.steps, unit.metric.scale * mean, unit.metric.scale * std
     if len(runs) > 1:
-        axes.fill_between(x, y - band, y + band, color=setting.color, alpha=0.18, linewidth=0)
+        axes.fill_between(x, y - band, y + band, color=color, alpha=0.18, linewidth=0)
     points: dict[str, Any] = {"marker": "o", "clip_on": False} if len(x) == 1 else {}
-    axes.plot(x, y, color=setting.color, linewidth=2.2, label=setting.label, **points)
+    axes.plot(x, y, color=color, linewidth=2.2, label=label, **points)
 
 
 def _papers(settings: Sequence[CurveSetting]) -> list[CurveSetting]:
@@ -151,26 +173,19 @@ def _papers(settings: Sequence[CurveSetting]) -> list[CurveSetting]:
 
 
 def _draw_paper_curve(
-    axes: Axes,
-    setting: CurveSetting,
-    is_alone: bool,
-    split: str,
-    metric: Metric,
-    unit: float,
-    right: float,
+    axes: Axes, setting: CurveSetting, curve: PaperCurve, color: Color | str, unit: _Unit
 ) -> None:
-    curve = setting.paper.get(split)
-    if curve is None:
+    """A curve of the paper's; one that is alone has a band, and says where it goes to."""
+    metric, label = unit.metric, setting.paper_label
+    x, y, band = curve.steps / unit.steps, metric.scale * curve.mean, metric.scale * curve.std
+    axes.plot(x, y, color=color, linewidth=1.6, linestyle=_PAPER_DASHES[0], label=label)
+    if color != PAPER_COLOR:
         return
-    x, y, band = curve.steps / unit, metric.scale * curve.mean, metric.scale * curve.std
-    color, dashes = (PAPER_COLOR if is_alone else setting.color), _PAPER_DASHES[0]
-    if is_alone:
-        axes.fill_between(x, y - band, y + band, color=color, alpha=0.15, linewidth=0)
-    axes.plot(x, y, color=color, linewidth=1.6, linestyle=dashes, label=setting.paper_label)
-    if is_alone and curve.steps[-1] > 1.05 * right:
+    axes.fill_between(x, y - band, y + band, color=color, alpha=0.15, linewidth=0)
+    if curve.steps[-1] > 1.05 * unit.right:
         million = 1e-6 * curve.steps[-1]
         end = f"paper after {million:.0f} million: {metric.text(curve.mean[-1])}{metric.unit}"
-        axes.axhline(y[-1], color=PAPER_COLOR, linewidth=0.9, linestyle=":", label=end)
+        axes.axhline(y[-1], color=color, linewidth=0.9, linestyle=":", label=end)
         axes.annotate(
             end,
             (0.0, y[-1]),
@@ -178,7 +193,7 @@ def _draw_paper_curve(
             xytext=(4, 3),
             textcoords="offset points",
             fontsize=8,
-            color=PAPER_COLOR,
+            color=color,
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8},
         )
 
@@ -223,27 +238,20 @@ def reference_curves(
     """
     figure = new_figure(7.4, 4.4 + 0.09 * (len(settings) + len(lines)))
     axes = figure.subplots()
-    right = max(run.steps[-1] for _, _, runs in settings for run in runs)
-    unit, unit_name = (1e6, "million") if right >= 1e6 else (1e3, "thousand")
+    unit = _Unit.of([run for _, _, runs in settings for run in runs], metric)
     for label, color, runs in settings:
-        steps, mean, std = mean_curve(runs)
-        x, y, band = steps / unit, metric.scale * mean, metric.scale * std
         spread = f"mean ± std of {len(runs)} seeds" if len(runs) > 1 else "1 seed"
-        if len(runs) > 1:
-            axes.fill_between(x, y - band, y + band, color=color, alpha=0.18, linewidth=0)
-        axes.plot(x, y, color=color, linewidth=2.0, label=f"{label} ({spread})")
+        _draw_mean(axes, runs, color, f"{label} ({spread})", unit)
     for number, (label, value) in enumerate(lines):
-        line_color = PAPER_COLOR if label.startswith("paper") else INK
-        dashes = _PAPER_DASHES[number // 2 % len(_PAPER_DASHES)]
-        name = f"{label}: {metric.text(value)}{metric.unit}"
         axes.axhline(
-            metric.scale * value, color=line_color, linestyle=dashes, linewidth=1.2, label=name
+            metric.scale * value,
+            color=PAPER_COLOR if label.startswith("paper") else INK,
+            linestyle=_PAPER_DASHES[number // 2 % len(_PAPER_DASHES)],
+            linewidth=1.2,
+            label=f"{label}: {metric.text(value)}{metric.unit}",
         )
-    axes.set_xlim(0.0, right / unit)
-    axes.set_ylim(0.0, 100.0 if metric.unit == "%" else None)
-    axes.set_xlabel(f"Environment steps on the new actions ({unit_name})", fontsize=9, color=INK)
+    unit.finish(axes, "Environment steps on the new actions")
     axes.set_ylabel(f"{metric.name}, training episodes", fontsize=9, color=INK)
-    tidy(axes)
     figure.legend(loc="outside lower center", ncols=2, **LEGEND)
     set_title(figure, title)
     return figure

@@ -8,17 +8,17 @@ from dataclasses import replace
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.pipeline import flags as flag
-from experiments.pipeline.artifacts import REPRESENTATION_SEED, Domain
 from experiments.reports import plots
 from experiments.reports.anchors import lines_of
 from experiments.reports.curves import CurveSetting, RunCurve, learning_curves
 from experiments.reports.paper import PaperCurve, paper_curve, paper_method
 from experiments.reports.plots import Bar, BarSetting, Color, Scatter
 from experiments.reports.results import ResultRow
-from experiments.reports.runs import Group, Run
+from experiments.reports.runs import Group, RunRecord
+from jaxnew.embedding import REPRESENTATION_SEED
 from jaxnew.representation import report
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.task.domain import Domain, load_task
 
 CURVE_SPLITS = ("train", "validation")
 BAR_SPLITS = ("train", "test")
@@ -26,7 +26,7 @@ MAX_TSNE_ACTIONS = 400
 MIN_TSNE_ACTIONS = 11  # More than its perplexity.
 TSNE_PARTS = {"heldout": ("validation", "test"), "train": ("train",), "all": ("all",)}
 
-# Place of the paper's methods in its palette of ten colours (spec method 11).
+# Place of the paper's methods in its palette of ten colours (docs/method.md, "Figures").
 _COLOR_INDEX = {
     "ours_no_entropy": 0,
     "ours_no_subsampling": 2,
@@ -62,7 +62,7 @@ def curves_figure(groups: Sequence[Group], title: str = "") -> Figure | None:
             settings.append(CurveSetting(group.label, color, curves, *_paper_curves(group)))
     if not settings:
         return None
-    title = title or f"{environment_of(groups)}: learning curves"
+    title = title or f"{groups[0].place}: learning curves"
     return learning_curves(settings, groups[0].metric, CURVE_SPLITS, title)
 
 
@@ -125,7 +125,7 @@ def bars_figure(
     if any(setting.anchors for setting in settings):
         footnote += "\nLines: policies without training, on sets of test actions."
     metric = groups[0].metric
-    title = title or f"{environment_of(groups)}: generalization to unseen actions"
+    title = title or f"{groups[0].place}: generalization to unseen actions"
     return plots.bars(settings, metric, title, footnote)
 
 
@@ -144,14 +144,9 @@ def _note(num_seeds: Sequence[int], steps: float | None) -> str:
     return f"{seeds}\n{plots.amount(steps)}"
 
 
-def environment_of(groups: Sequence[Group]) -> str:
-    """The paper's name of where the groups' runs were, or the task's."""
-    return groups[0].paper_environment or groups[0].task.name
-
-
-def tsne_figures(runs: Sequence[Run]) -> list[tuple[str, Figure]]:
+def tsne_figures(runs: Sequence[RunRecord]) -> list[tuple[str, Figure]]:
     """Names and figures of the distinct representation tables; runs without one are named."""
-    distinct: dict[str, Run] = {}
+    distinct: dict[str, RunRecord] = {}
     for run in runs:
         if run.table is None or run.split is None:
             print(f"{run.path} has no representation table yet, so no picture of it.")
@@ -167,13 +162,14 @@ def tsne_figures(runs: Sequence[Run]) -> list[tuple[str, Figure]]:
     return figures
 
 
-def tsne_figure(run: Run, part: str) -> Figure | None:
+def tsne_figure(run: RunRecord, part: str) -> Figure | None:
     """Representations of one part of the split, by class; None if it has too few actions."""
     if run.table is None or run.split is None:
         return None
-    domain = Domain.of(flag.load_task(run.config["task"]), run.config["split"])
+    config = run.config
+    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
     domain = replace(domain, split=run.split)
-    panel = tsne_panel(domain, run.table, part, int(run.config["seed"]))
+    panel = tsne_panel(domain, run.table, part, int(config["seed"]))
     if panel is None:
         print(f"{run.path}: too few actions for a picture of part {part!r}.")
         return None

@@ -1,12 +1,12 @@
-"""The figures of the paper: which settings each of them shows, by task (experiments spec 2)."""
+"""The figures of the paper: which settings each of them shows, by task."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
-from experiments.pipeline import flags as flag
 from experiments.reports.production import Cell
+from jaxnew.task.places import UsageError
 
 _BASELINES = ("ours", "continuous", "nearest-neighbour")
 _ABLATIONS = ("ours", "no-entropy", "no-subsampling")
@@ -14,17 +14,8 @@ _ALL = ("ours", "continuous", "nearest-neighbour", "no-entropy", "no-subsampling
 
 # Tasks of the paper's main text, and the nine further ones of its appendix.
 _CREATE = ("create-push", "create-obstacle", "create-seesaw")
-_FURTHER_CREATE = (
-    "create-navigate",
-    "create-belt",
-    "create-buckets",
-    "create-cannon",
-    "create-collide",
-    "create-moving",
-    "create-ladder",
-    "create-basket",
-    "create-funnel",
-)
+_FURTHER = "navigate belt buckets cannon collide moving ladder basket funnel"
+_FURTHER_CREATE = tuple(f"create-{level}" for level in _FURTHER.split())
 
 
 @dataclass(frozen=True)
@@ -52,17 +43,31 @@ class PaperFigure:
 
 def _cells(methods: Sequence[str], representation: str, *more: str) -> tuple[Cell, ...]:
     """Methods on one representation, then ours on further ones."""
-    extra = tuple(Cell("ours", name) for name in more)
-    return (*(Cell(method, representation) for method in methods), *extra)
+    return (*(Cell(method, representation) for method in methods), *_encoders(*more))
+
+
+def _encoders(*names: str) -> tuple[Cell, ...]:
+    """Ours on representations."""
+    return tuple(Cell("ours", name) for name in names)
 
 
 def _each(tasks: Sequence[str], cells: tuple[Cell, ...]) -> dict[str, tuple[Cell, ...]]:
     return dict.fromkeys(tasks, cells)
 
 
+def _everywhere(methods: Sequence[str], *more: str) -> dict[str, tuple[Cell, ...]]:
+    """The same on all tasks of the main text; the Recommender has one representation."""
+    return {
+        "grid_world": _cells(methods, "hvae", *more),
+        "recommender": _cells(methods, "product"),
+        _STACKING: _cells(methods, "hvae", *more),
+        **_each(_CREATE, _cells(methods, "hvae", *more)),
+    }
+
+
 _OURS = Cell("ours", "hvae")
+_FULL = Cell("ours", "hvae", split="full")
 _STACKING = "shape_stacking"
-# Experiments spec 3 and 14.
 _STACKING_NOTE = (
     "The paper's bars of Shape Stacking merge the results of several machines, which agree within "
     "a machine rather than within a seed, and some values were typed by hand "
@@ -73,44 +78,28 @@ _FIXED_SET_NOTE = (
     "which rebuilds the scene at each drop, and are not comparable with any other."
 )
 _TUNED = _cells(("ours", "nearest-neighbour"), "hvae")
-# The encoder of the analysis has seen its whole universe (spec method 10).
+# The encoder of the analysis has seen its whole universe (docs/create.md, "Analysis").
 _ANALYSED = _each(_CREATE, (Cell("ours", "hvae-oracle", variant="-analysis"),))
 
 FIGURES: dict[str, PaperFigure] = {
     "4": PaperFigure(
-        "bars",
-        "baselines",
-        {
-            "grid_world": _cells(_BASELINES, "hvae", "vae"),
-            "recommender": _cells(_BASELINES, "product"),
-            _STACKING: _cells(_BASELINES, "hvae", "vae"),
-            **_each(_CREATE, _cells(_BASELINES, "hvae", "vae")),
-        },
-        notes={_STACKING: _FIXED_SET_NOTE},
+        "bars", "baselines", _everywhere(_BASELINES, "vae"), notes={_STACKING: _FIXED_SET_NOTE}
     ),
     "5": PaperFigure(
         "representations",
         "held-out tools",
-        _each((*_CREATE, *_FURTHER_CREATE), _cells((), "", "hvae", "vae")),
+        _each((*_CREATE, *_FURTHER_CREATE), _encoders("hvae", "vae")),
     ),
     "6": PaperFigure(
-        "bars",
-        "ablations",
-        {
-            "grid_world": _cells(_ABLATIONS, "hvae"),
-            "recommender": _cells(_ABLATIONS, "product"),
-            _STACKING: _cells(_ABLATIONS, "hvae"),
-            **_each(_CREATE, _cells(_ABLATIONS, "hvae")),
-        },
-        notes={_STACKING: _FIXED_SET_NOTE},
+        "bars", "ablations", _everywhere(_ABLATIONS), notes={_STACKING: _FIXED_SET_NOTE}
     ),
     "7a": PaperFigure(
         "bars",
         "tools of unseen classes",
-        _each(_CREATE, (Cell("ours", "hvae", split="full"),)),
+        _each(_CREATE, (_FULL,)),
         note="The paper's numbers are those of its last runs. Older runs in its release reached "
-        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`; "
-        "experiments spec 5), so that the target is uncertain.",
+        "far more on test tools (`alt_create_full_split_older` in `experiments/paper/results.csv`),"
+        " so that the target is uncertain.",
     ),
     "7b": PaperFigure(
         "bars",
@@ -122,7 +111,7 @@ FIGURES: dict[str, PaperFigure] = {
         },
         notes={
             _STACKING: f"{_STACKING_NOTE} Its engineered vectors had their classes in an order "
-            "that changed from process to process (spec shape_stacking 8); ours do not."
+            "that changed from process to process; ours do not."
         },
     ),
     "8": PaperFigure(
@@ -137,25 +126,20 @@ FIGURES: dict[str, PaperFigure] = {
     "14": PaperFigure(
         "representations",
         "held-out actions",
-        {"grid_world": _cells((), "", "hvae", "vae", "hvae-onehot", "gt12")},
+        {"grid_world": _encoders("hvae", "vae", "hvae-onehot", "gt12")},
     ),
     "15": PaperFigure(
         "representations",
         "held-out tools",
         _each(
             (*_CREATE, *_FURTHER_CREATE),
-            (*_cells((), "", "hvae", "vae", "hvae-video"), Cell("ours", "hvae", split="full")),
+            (*_encoders("hvae", "vae", "hvae-video"), _FULL),
         ),
     ),
     "16": PaperFigure(
         "representations",
         "held-out shapes",
-        {
-            _STACKING: (
-                *_cells((), "", "hvae", "vae"),
-                Cell("ours", "hvae", split="full"),
-            )
-        },
+        {_STACKING: (*_encoders("hvae", "vae"), _FULL)},
     ),
     "18": PaperFigure("bars", "further tasks", _each(_FURTHER_CREATE, _cells(_ALL, "hvae", "vae"))),
     "19": PaperFigure(
@@ -172,8 +156,8 @@ FIGURES: dict[str, PaperFigure] = {
         "bars",
         "no reward for subgoals",
         _each(_CREATE, (_OURS, Cell("ours", "hvae", variant="-no-subgoals"))),
-        note="Ours is paid for the goal only (spec create 6.6); the release does not record which "
-        "rewards the paper's runs lacked.",
+        note="Ours is paid for the goal only; the release does not record which rewards the "
+        "paper's runs lacked.",
     ),
     "21": PaperFigure(
         "bars",
@@ -194,7 +178,7 @@ FIGURES: dict[str, PaperFigure] = {
                 _OURS,
                 Cell("ours", "hvae", variant="-no-place"),
                 Cell("ours", "hvae", variant="-2d-place"),
-                Cell("ours", "hvae", split="full"),
+                _FULL,
             )
         },
         note=_STACKING_NOTE,
@@ -202,12 +186,7 @@ FIGURES: dict[str, PaperFigure] = {
     "24": PaperFigure(
         "curves",
         "learning curves",
-        {
-            "grid_world": _cells(_ALL, "hvae", "vae"),
-            "recommender": _cells(_ALL, "product"),
-            _STACKING: _cells(_ALL, "hvae", "vae"),
-            **_each(_CREATE, _cells(_ALL, "hvae", "vae")),
-        },
+        _everywhere(_ALL, "vae"),
         notes={
             _STACKING: "The paper's train curves of methods with one fixed set come from another "
             "simulator, which rebuilds the scene at each drop; ours are not compared with them."
@@ -224,10 +203,10 @@ def number_of(number: str, task: str) -> str:
       UsageError: there is none, or it does not show the task.
     """
     if number not in FIGURES:
-        raise flag.UsageError(f"No figure {number!r}; choose of {', '.join(FIGURES)}.")
+        raise UsageError(f"No figure {number!r}; choose of {', '.join(FIGURES)}.")
     wanted = [number, *([_SAME[number]] if number in _SAME else [])]
     for candidate in wanted:
         if task in FIGURES[candidate].cells:
             return candidate
     shown = ", ".join(task for candidate in wanted for task in FIGURES[candidate].cells)
-    raise flag.UsageError(f"Figure {number} does not show {task}; it shows {shown}.")
+    raise UsageError(f"Figure {number} does not show {task}; it shows {shown}.")

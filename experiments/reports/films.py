@@ -1,63 +1,50 @@
-"""Zero-shot episodes of a trained policy as films, successes apart from failures (paper figure 8).
+"""Zero-shot episodes of a trained policy as films: many of them (paper figure 8), or one.
 
-They are episodes of `evaluate`. On the host they are played twice, see `_host_episodes`; inside jit
-their states are kept and drawn.
+They are episodes of `evaluate`; a film that ends otherwise than its episode is refused.
 """
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Iterator, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from PIL import Image
 
-from experiments.pipeline.flags import UsageError
-from experiments.pipeline.training import Trainer, load_state, load_trainer
-from experiments.reports import plots
-from experiments.reports.episode import play_episodes
-from experiments.reports.host_episodes import check_film, play_host_episodes
+from experiments.reports import plots, tables
 from experiments.reports.plots import Metric
 from experiments.reports.video import write_video
-from jaxnew.ppo import TrainState
-from jaxnew.task import Filming, MakeFilm
+from jaxnew.rollout.contract import Episode
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.run import Run
+from jaxnew.task.places import UsageError
+from jaxnew.task.presentation import Film, Filming
 
 SUCCESS, FAILURE = "success", "failure"
-_FILE = "episode-{:03d}"
 _NUM_COLUMNS = 5
 _GOOD, _BAD = "#1b7f4d", "#b3382c"
+_CANDIDATES = 50  # Episodes of which an animation shows the first success.
+_SIZE = 360  # Pixels of an animation's height.
 
 
 @dataclass(frozen=True)
-class FilmedEpisode:
-    """An episode and its pictures.
+class FilmOptions:
+    """How the films of figure 8 are made.
 
     Attributes:
-      number: i of the evaluation.
-      is_success: how it ended.
-      action_ids: what was chosen.
-      metrics: at its end.
-      frames: uint8[height, width, 3] each.
-      page: HTML, if it was asked for.
+      count: episodes, from number 0.
+      size: pixels of a side.
+      suffix: .gif or .mp4.
+      with_pages: an interactive page of each episode as well.
     """
 
-    number: int
-    is_success: bool
-    action_ids: Sequence[int]
-    metrics: dict[str, float]
-    frames: Sequence[np.ndarray]
-    page: str | None = None
-
-    @property
-    def outcome(self) -> str:
-        """Of its folder."""
-        return SUCCESS if self.is_success else FAILURE
+    count: int = 20
+    size: int = 512
+    suffix: str = ".gif"
+    with_pages: bool = False
 
 
 @dataclass(frozen=True)
@@ -77,30 +64,17 @@ class Still:
 
 
 def film_run(
-    path: Path,
-    out: Path,
-    count: int,
-    size: int = 512,
-    suffix: str = ".gif",
-    title: str = "",
-    num_workers: int = 0,
-    with_pages: bool = False,
+    path: Path, out: Path, title: str = "", options: FilmOptions | None = None, num_workers: int = 0
 ) -> list[Path]:
-    """Films of the best checkpoint's first episodes on sets of test actions.
-
-    Into `out/success` and `out/failure` go, for every episode, its film, its first and its last
-    picture, and its page; earlier ones are removed. Beside `out`, a sheet of the last pictures and
-    a table.
+    """Films the first episodes of a run's best checkpoint on sets of test actions.
 
     Args:
-      path: a run of `train` or a member of `sweep`.
-      out: folder.
-      count: episodes.
-      size: pixels of the pictures' height.
-      suffix: .gif or .mp4.
+      path: of the run.
+      out: folder of the films, in `success/` and `failure/`, with a first and a last picture beside
+        each. `OUT.png` shows all last pictures, `OUT.csv` has a line per episode.
       title: of the sheet.
-      num_workers: processes for environments; 0: one per core.
-      with_pages: whether to make an interactive page of each episode as well.
+      options: default: 20 GIFs.
+      num_workers: processes for environments on the host; 0: one per core.
 
     Returns:
       The sheet, the table and the films.
@@ -110,90 +84,70 @@ def film_run(
       ImportError: a package that films or pages need is missing.
       RuntimeError: an episode went another way when it was played again.
     """
-    run, trainer, _ = load_trainer(path, num_workers)
-    task = trainer.task
-    with closing(trainer):
-        state, _ = load_state(run, trainer, "best")
-        episodes = filmed(trainer, state, count, size, with_pages)
-        clear(out)
+    options = options or FilmOptions()
+    with Run.load(path, "best", num_workers=num_workers) as run:
+        filming, metric = filming_of(run), run.task.selection_metric
+        if options.with_pages and not filming.has_pages:
+            raise UsageError(f"Task {run.task.name} has no interactive pages; omit --film_pages.")
         rows, stills, films = [], [], []
-        for episode in episodes:
-            films.append(write_episode(episode, out, suffix))
-            value = episode.metrics[task.selection_metric]
-            stills.append(Still(episode.number, episode.is_success, value, episode.frames[-1]))
-            rows.append(_row(episode, films[-1].relative_to(out.parent)))
+        _clear(out)
+        for episode, film in filmed(run, run.play(count=options.count), options.size):
+            value = episode.metrics[metric]
+            still = Still(episode.number, filming.is_success(value), value, film.frames[-1])
+            stills.append(still)
+            outcome = SUCCESS if still.is_success else FAILURE
+            films.append(_write(out / outcome, episode.number, film, filming, options))
+            rows.append(_row(episode, outcome, films[-1].relative_to(out.parent)))
     table = out.with_suffix(".csv")
-    with table.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    if task.filming is not None and task.filming.criterion:
-        metric = Metric.of(task.selection_metric)
-        picture = ranked_sheet(stills, metric, task.filming.criterion, title)
-    else:
-        picture = sheet(stills, title)
+    table.write_text(tables.csv_text(rows), encoding="utf-8")
+    picture = sheet(stills, title)
+    if filming.criterion:
+        picture = ranked_sheet(stills, Metric.of(metric), filming.criterion, title)
     return [*plots.save(picture, out.with_suffix(".png")), table, *films]
 
 
-def _row(episode: FilmedEpisode, film: Path) -> dict[str, Any]:
-    """An episode in the table."""
-    return {
-        "episode": episode.number,
-        "outcome": episode.outcome,
-        "num_actions": len(episode.action_ids),
-        **episode.metrics,
-        "action_ids": " ".join(map(str, episode.action_ids)),
-        "film": film,
-    }
-
-
-def filmed(
-    trainer: Trainer, state: TrainState, count: int, size: int, with_pages: bool = False
-) -> Iterator[FilmedEpisode]:
-    """The first episodes on sets of test actions; each is drawn when it is asked for.
+def filming_of(run: Run) -> Filming:
+    """How a run's episodes are shown.
 
     Raises:
-      UsageError: the task's episodes cannot be drawn, or not as pages.
+      UsageError: they cannot be drawn.
     """
-    host, filming = trainer.task.host, trainer.task.filming
-    if with_pages and (filming is None or filming.make_page is None):
-        raise UsageError(f"Task {trainer.task.name} has no interactive pages; omit --film_pages.")
-    if host is not None and host.make_film is not None:
-        return _filmed_on_host(host.make_film, trainer, state, count, size)
-    if filming is not None:
-        return _filmed_inside_jit(filming, trainer, state, count, size, with_pages)
-    raise UsageError(f"Episodes of task {trainer.task.name} cannot be filmed.")
+    if run.task.shown.filming is None:
+        raise UsageError(f"Episodes of task {run.task.name} cannot be filmed.")
+    return run.task.shown.filming
 
 
-def _filmed_on_host(
-    make_film: MakeFilm, trainer: Trainer, state: TrainState, count: int, size: int
-) -> Iterator[FilmedEpisode]:
-    for episode in play_host_episodes(trainer, state, "test", count):
-        film = make_film(episode.seed, episode.ids, episode.positions, size=size)
+def filmed(run: Run, episodes: Sequence[Episode], size: int) -> Iterator[tuple[Episode, Film]]:
+    """Episodes of a run, each with its film, which is drawn when it is asked for.
+
+    Raises:
+      UsageError: the task's episodes cannot be drawn.
+      RuntimeError: one went another way when it was played again.
+    """
+    filming, rollout = filming_of(run), run.trainer.rollout
+    place = rollout.env if isinstance(rollout, DeviceRollout) else run.task.environment
+    for episode in episodes:
+        film = filming.draw(place, episode, size=size)
         check_film(episode, film)
-        is_success = episode.metrics[trainer.task.selection_metric] > 0
-        ids = episode.ids.tolist()
-        yield FilmedEpisode(episode.number, is_success, ids, episode.metrics, film.frames)
+        yield episode, film
 
 
-def _filmed_inside_jit(
-    filming: Filming,
-    trainer: Trainer,
-    state: TrainState,
-    count: int,
-    size: int,
-    with_pages: bool,
-) -> Iterator[FilmedEpisode]:
-    env = trainer.evaluator.env
-    for e in play_episodes(trainer, state, "test", 0, count):
-        frames = filming.draw(env, e.states, e.actions, e.rewards, size=size)
-        page = None
-        if with_pages and filming.make_page is not None:
-            page = filming.make_page(env, e.states, e.actions)
-        yield FilmedEpisode(e.number, e.is_success, e.action_ids, e.metrics, frames, page)
+def check_film(episode: Episode, film: Film) -> None:
+    """Refuses a film that does not end as its episode did.
+
+    Raises:
+      RuntimeError: it does not.
+    """
+    played = {name: value for name, value in episode.metrics.items() if name != "num_steps"}
+    shown = {name: film.metrics[name] for name in played}
+    if not np.allclose(list(shown.values()), list(played.values()), atol=1e-5, equal_nan=True):
+        raise RuntimeError(
+            f"Episode {episode.number} ended with {played}, and with {shown} when it was played "
+            "again; the environment is not a function of its seed and its actions."
+        )
 
 
-def clear(out: Path) -> None:
+def _clear(out: Path) -> None:
     """Removes films and pictures of an earlier call."""
     for outcome in (SUCCESS, FAILURE):
         (out / outcome).mkdir(parents=True, exist_ok=True)
@@ -201,14 +155,75 @@ def clear(out: Path) -> None:
             file.unlink()
 
 
-def write_episode(episode: FilmedEpisode, out: Path, suffix: str) -> Path:
+def _write(folder: Path, number: int, film: Film, filming: Filming, options: FilmOptions) -> Path:
     """An episode's film; beside it its first and last picture and its page. Returns the film."""
-    stem = out / episode.outcome / _FILE.format(episode.number)
-    for word, frame in (("start", episode.frames[0]), ("end", episode.frames[-1])):
+    stem = folder / f"episode-{number:03d}"
+    for word, frame in (("start", film.frames[0]), ("end", film.frames[-1])):
         Image.fromarray(frame).save(stem.with_name(f"{stem.name}-{word}.png"))
-    if episode.page is not None:
-        stem.with_suffix(".html").write_text(episode.page, encoding="utf-8")
-    return write_video(episode.frames, stem.with_suffix(suffix))
+    if options.with_pages and film.make_page is not None:
+        stem.with_suffix(".html").write_text(film.make_page(), encoding="utf-8")
+    return write_video(film.frames, stem.with_suffix(options.suffix), filming.frame_ms)
+
+
+def _row(episode: Episode, outcome: str, film: Path) -> dict[str, Any]:
+    """An episode in the table."""
+    return {
+        "episode": episode.number,
+        "outcome": outcome,
+        "num_actions": len(episode.actions),
+        **episode.metrics,
+        "action_ids": " ".join(map(str, episode.action_ids)),
+        "film": film,
+    }
+
+
+def animate_run(
+    path: Path, out: Path, part: str = "test", episode: int | None = None
+) -> list[Path]:
+    """Films one episode of a run's best checkpoint and says how it went.
+
+    Args:
+      path: of the run.
+      out: the animation, a GIF; its last picture has the same name with `.png`.
+      part: of the split, that the available set is drawn from.
+      episode: its number; None takes the first successful one of 0..49, and says so.
+
+    Returns:
+      The two files.
+
+    Raises:
+      UsageError: the task's episodes cannot be drawn.
+    """
+    with Run.load(path, "best") as run:
+        filming, metric = filming_of(run), run.task.selection_metric
+        if episode is None:
+            played = run.play(part, count=_CANDIDATES)
+            number, how = choose([filming.is_success(e.metrics[metric]) for e in played])
+            chosen = played[number]
+        else:
+            (chosen,) = run.play(part, episode)
+            how = f"episode {episode}, as asked for"
+        ((_, film),) = filmed(run, [chosen], _SIZE)
+        names = run.task.make_universe().action_names
+        seen = np.isin(chosen.available_ids, run.split.train).sum()
+        outcome = "success" if filming.is_success(chosen.metrics[metric]) else "no success"
+        print(
+            f"{out}: {how}; sets of {len(chosen.available_ids)} {part} actions, {seen} of them "
+            f"seen in training; {outcome} with {', '.join(names[i] for i in chosen.action_ids)}, "
+            f"return {sum(chosen.rewards):.3f}."
+        )
+    write_video(film.frames, out, filming.frame_ms)
+    Image.fromarray(film.frames[-1]).save(out.with_suffix(".png"))
+    return [out, out.with_suffix(".png")]
+
+
+def choose(successes: Sequence[bool]) -> tuple[int, str]:
+    """The first success, or 0 if there is none; and how it was chosen."""
+    numbers = f"episodes 0..{len(successes) - 1}"
+    if not any(successes):
+        return 0, f"episode 0: none of {numbers} was successful"
+    first, share = successes.index(True), f"{sum(successes)} of {len(successes)} were"
+    return first, f"episode {first}, first successful of {numbers} ({share})"
 
 
 def sheet(stills: Sequence[Still], title: str = "") -> Figure:
@@ -218,19 +233,16 @@ def sheet(stills: Sequence[Still], title: str = "") -> Figure:
       stills: of each.
       title: of the sheet; the share of successes is added.
     """
-    figure, every = _grid(len(stills))
-    for axes, still in zip(every, stills, strict=False):
-        _show(axes, still)
-        outcome = SUCCESS if still.is_success else FAILURE
-        axes.set_title(f"episode {still.number}: {outcome}", fontsize=9, color=_color(still))
-    _set_title(figure, title, stills, "successful")
-    return figure
+    labels = [
+        f"episode {still.number}: {SUCCESS if still.is_success else FAILURE}" for still in stills
+    ]
+    return _pictures(stills, labels, _title(title, stills, "successful"))
 
 
 def ranked_sheet(
     stills: Sequence[Still], metric: Metric, criterion: str, title: str = ""
 ) -> Figure:
-    """The last pictures of the best and of the worst episodes, with their metric below each.
+    """The last pictures of the best and of the worst episodes, with their metric above each.
 
     Args:
       stills: of all episodes; up to ten of them are shown, from best to worst.
@@ -241,37 +253,28 @@ def ranked_sheet(
     ranked = sorted(stills, key=lambda still: -still.value)
     if len(ranked) > 2 * _NUM_COLUMNS:
         ranked = ranked[:_NUM_COLUMNS] + ranked[-_NUM_COLUMNS:]
-    figure, every = _grid(len(ranked))
-    for axes, still in zip(every, ranked, strict=False):
-        _show(axes, still)
-        text = f"{metric.text(still.value)}{metric.unit} (episode {still.number})"
-        axes.set_xlabel(text, fontsize=9, color=_color(still))
-    chosen = "" if len(ranked) == len(stills) else f", best and worst of {len(stills)}"
-    _set_title(figure, f"{title}{chosen}", stills, criterion)
+        title += f", best and worst of {len(stills)}"
+    labels = [f"{metric.text(s.value)}{metric.unit} (episode {s.number})" for s in ranked]
+    return _pictures(ranked, labels, _title(title, stills, criterion))
+
+
+def _pictures(stills: Sequence[Still], labels: Sequence[str], title: str) -> Figure:
+    """Pictures in rows of five, with a label above each in the colour of its outcome."""
+    num_rows = -(-len(stills) // _NUM_COLUMNS)
+    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
+    every = figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel()
+    for axes, still, label in zip(every, stills, labels, strict=False):
+        axes.imshow(still.picture, interpolation="none")
+        axes.set_xticks([])
+        axes.set_yticks([])
+        axes.spines[:].set_color(plots.GRID_COLOR)
+        axes.set_title(label, fontsize=9, color=_GOOD if still.is_success else _BAD)
+    for axes in every[len(stills) :]:
+        axes.set_axis_off()
+    plots.set_title(figure, title)
     return figure
 
 
-def _grid(count: int) -> tuple[Figure, list[Axes]]:
-    """A figure with room for so many pictures."""
-    num_rows = -(-count // _NUM_COLUMNS)
-    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
-    every = list(figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel())
-    for axes in every[count:]:
-        axes.set_axis_off()
-    return figure, every
-
-
-def _show(axes: Axes, still: Still) -> None:
-    axes.imshow(still.picture, interpolation="none")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.spines[:].set_color(plots.GRID_COLOR)
-
-
-def _color(still: Still) -> str:
-    return _GOOD if still.is_success else _BAD
-
-
-def _set_title(figure: Figure, title: str, stills: Sequence[Still], criterion: str) -> None:
+def _title(title: str, stills: Sequence[Still], criterion: str) -> str:
     share = f"{sum(still.is_success for still in stills)} of {len(stills)} {criterion}"
-    plots.set_title(figure, f"{title} ({share})" if title else share)
+    return f"{title} ({share})" if title else share

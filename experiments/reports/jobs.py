@@ -10,19 +10,20 @@ import math
 import shlex
 import signal
 import subprocess
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from experiments.pipeline.artifacts import TABLE_FILE, parse_representation
-from experiments.pipeline.flags import UsageError
-from experiments.pipeline.methods import file_name
+from experiments.main import child
 from experiments.reports.plots import amount
 from experiments.reports.production import Cell, Source
+from experiments.reports.runs import read_runs
 from jaxnew.cores import available_cores
-from jaxnew.task import StageTwoBudget
+from jaxnew.embedding import TABLE_FILE, parse_representation
+from jaxnew.storage.run_directory import RunDirectoryError
+from jaxnew.task.methods import file_name
+from jaxnew.task.places import UsageError
 
 
 @dataclass(frozen=True)
@@ -34,12 +35,22 @@ class Job:
       command: `python -m experiments.NAME` without its beginning.
       cost: how long it takes.
       seconds: the same as a number; None if nobody measured it.
+      folder: of the run or the sweep that it makes.
     """
 
     title: str
     command: tuple[str, ...]
     cost: str
     seconds: float | None
+    folder: Path
+
+    @property
+    def is_done(self) -> bool:
+        """Whether all its runs are finished."""
+        try:
+            return all(run.is_finished for run in read_runs([self.folder]))
+        except (UsageError, RunDirectoryError):  # Not begun, or a sweep that is not over.
+            return False
 
     def run(self) -> None:
         """Runs the command in a process of its own, and lets it save and end on a signal.
@@ -48,7 +59,8 @@ class Job:
           UsageError: the command failed, or was stopped.
         """
         print(f"{self.title} ({self.cost}): {self.text}", flush=True)
-        process = subprocess.Popen([sys.executable, "-m", *self._module, *self.command[1:]])
+        line, environment = child(*self.command)
+        process = subprocess.Popen(line, env=environment)
         received: list[int] = []
 
         def stop(number: int, frame: Any) -> None:
@@ -68,13 +80,9 @@ class Job:
             raise UsageError(f"The command ended with status {status}: {self.text}")
 
     @property
-    def _module(self) -> tuple[str, ...]:
-        return (f"experiments.{self.command[0]}",)
-
-    @property
     def text(self) -> str:
         """The whole command, for a shell."""
-        return shlex.join(["python", "-m", *self._module, *self.command[1:]])
+        return shlex.join(["python", "-m", f"experiments.{self.command[0]}", *self.command[1:]])
 
 
 def embed_job(source: Source, representation: str) -> Job | None:
@@ -83,19 +91,20 @@ def embed_job(source: Source, representation: str) -> Job | None:
     is_learned = representation.startswith(("hvae", "vae"))
     if not is_learned or representation in source.given:
         return None
-    if (source.embed_folder(representation) / TABLE_FILE).exists():
+    folder = source.embed_folder(representation)
+    if (folder / TABLE_FILE).exists():
         return None
     budget = domain.stage_one(parse_representation(domain, representation).play, source.stage_one)
     command = (
         "embed",
         # By the name of its actions, so that tasks which share them have one command.
         f"--task={domain.task.actions_name or domain.task.reference}",
-        f"--split={domain.split_name}",
+        *_split_flags(source),
         f"--representation={representation}",
         f"--budget={source.stage_one}",
         f"--runs={source.folder}",
     )
-    return Job(f"Representation {representation}", command, budget.cost, None)
+    return Job(f"Representation {representation}", command, budget.cost, None, folder)
 
 
 def training_jobs(source: Source, cell: Cell, seeds: Sequence[int]) -> list[Job]:
@@ -112,45 +121,21 @@ def train_job(source: Source, cell: Cell, seed: int, folder: Path | None = None)
       source: of the cell.
       folder: of the run; default: one that names all that the cell fixes.
     """
-    budget = source.budget_of(cell.method)
+    config = source.config_of(cell)
     if folder is None:
         words = [file_name(cell.method), cell.representation]
         words += ["conditioned"] if cell.conditions_position else []
-        words += [source.domain.split_name, source.budget, str(budget.num_updates), str(seed)]
+        words += [source.domain.split_label, source.budget, str(config.num_updates), str(seed)]
         folder = source.domain.folder(source.folder) / "-".join(words)
-    command = (
-        "train",
-        *_settings(source, cell),
-        f"--seed={seed}",
-        f"--workdir={folder}",
-        *([f"--workers={source.workers}"] if source.workers else []),
-        *_assignments(source, cell, budget),
-    )
-    steps = budget.num_updates * budget.ppo.steps_per_update
-    seconds = training_seconds(source, cell.method, steps, 1)
+    own = [f"--seed={seed}", f"--workdir={folder}", *_workers(source)]
+    command = ("train", *_settings(source, cell), *own, *_assignments(source, cell))
+    steps = config.num_updates * config.ppo.steps_per_update
+    seconds = training_seconds(source, cell.method, steps)
     cost = duration(seconds)
     if seconds is None:
-        cost += f"; a whole run of budget {source.budget} takes {budget.cost}"
-    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds)
-
-
-def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
-    """Flags of `train` and `sweep` that say what is trained."""
-    return (
-        f"--task={source.domain.task.reference}",
-        f"--split={source.domain.split_name}",
-        f"--method={cell.method}",
-        f"--representation={source.representation_flag(cell.representation)}",
-        f"--representation_budget={source.stage_one}",
-        f"--budget={source.budget}",
-        f"--runs={source.folder}",
-    )
-
-
-def _assignments(source: Source, cell: Cell, budget: StageTwoBudget) -> tuple[str, ...]:
-    conditioned = ["conditions_position=true"] if cell.conditions_position else []
-    listed = [*source.assignments, *conditioned, f"num_updates={budget.num_updates}"]
-    return tuple(f"--set={assignment}" for assignment in listed)
+        whole = source.domain.task.budget(source.budget).cost
+        cost += f"; a whole run of budget {source.budget} takes {whole}"
+    return Job(f"{cell.label}, seed {seed}, {amount(steps)}", command, cost, seconds, folder)
 
 
 def sweep_job(
@@ -167,34 +152,57 @@ def sweep_job(
       folder: of the sweep; default: one that names all that the cell fixes.
       vary: values of `--vary`, each `FIELD=VALUE,VALUE...`.
     """
-    domain = source.domain
-    budget = source.budget_of(cell.method)
-    listed = ",".join(map(str, seeds))
-    words = ["sweep", file_name(cell.method), cell.representation]
-    words += [domain.split_name] * (domain.split_name != domain.task.default_split)
-    words += [source.budget, str(budget.num_updates), listed.replace(",", "-")]
-    folder = folder or domain.folder(source.folder) / "-".join(words)
-    command = (
-        "sweep",
-        *_settings(source, cell),
-        f"--seeds={listed}",
-        f"--workdir={folder}",
-        *(f"--vary={values}" for values in vary),
-        *_assignments(source, cell, budget),
-    )
-    steps = budget.num_updates * budget.ppo.steps_per_update
+    domain, config = source.domain, source.config_of(cell)
+    if folder is None:
+        words = ["sweep", file_name(cell.method), cell.representation]
+        words += ["conditioned"] if cell.conditions_position else []
+        words += [domain.split_label] * (domain.split_label != domain.task.default_split)
+        words += [source.budget, str(config.num_updates), *map(str, seeds)]
+        folder = domain.folder(source.folder) / "-".join(words)
+    own = [f"--seeds={','.join(map(str, seeds))}", f"--workdir={folder}"]
+    own += [f"--vary={values}" for values in vary]
+    command = ("sweep", *_settings(source, cell), *own, *_assignments(source, cell))
+    steps = config.num_updates * config.ppo.steps_per_update
     num_runs = len(seeds) * math.prod(values.count(",") + 1 for values in vary)
     seconds = training_seconds(source, cell.method, steps * num_runs, num_runs)
     title = f"{cell.label}, {num_runs} runs of {amount(steps)} in one program"
-    return Job(title, command, duration(seconds), seconds)
+    return Job(title, command, duration(seconds), seconds, folder)
 
 
-def training_seconds(source: Source, method: str, steps: float, num_runs: int) -> float | None:
+def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
+    """Flags of `train` and `sweep` that say what is trained."""
+    return (
+        f"--task={source.domain.task.reference}",
+        *_split_flags(source),
+        f"--method={cell.method}",
+        f"--representation={source.given.get(cell.representation, cell.representation)}",
+        f"--representation_budget={source.stage_one}",
+        f"--budget={source.budget}",
+        f"--runs={source.folder}",
+    )
+
+
+def _split_flags(source: Source) -> list[str]:
+    domain = source.domain
+    seed = [f"--split_seed={domain.split_seed}"] if domain.split_seed else []
+    return [f"--split={domain.split_name}", *seed]
+
+
+def _workers(source: Source) -> list[str]:
+    return [f"--workers={source.workers}"] if source.workers else []
+
+
+def _assignments(source: Source, cell: Cell) -> tuple[str, ...]:
+    updates = f"num_updates={source.config_of(cell).num_updates}"
+    return tuple(f"--set={text}" for text in (*source.assignments, *cell.assignments, updates))
+
+
+def training_seconds(source: Source, method: str, steps: float, num_runs: int = 1) -> float | None:
     """How long `steps` of training take, in all of `num_runs` runs of a sweep.
 
     A single run on the host is foretold as on one core; its workers make it faster on several.
     """
-    measured = source.domain.task.measured
+    measured = source.domain.task.shown.measured
     if measured is None:
         return None
     rate = measured.training.get(method, measured.training["ours"])
@@ -204,7 +212,7 @@ def training_seconds(source: Source, method: str, steps: float, num_runs: int) -
 
 def evaluation_seconds(source: Source, num_episodes: float) -> float | None:
     """How long so many episodes take."""
-    measured = source.domain.task.measured
+    measured = source.domain.task.shown.measured
     return None if measured is None else num_episodes / measured.evaluation
 
 
@@ -220,7 +228,10 @@ def duration(seconds: float | None) -> str:
 
 
 def announce(
-    jobs: Sequence[Job], episodes: int, evaluation: float | None, tuned: Sequence[float | None] = ()
+    jobs: Sequence[Job],
+    episodes: int = 0,
+    evaluation: float | None = None,
+    tuned: Sequence[float | None] = (),
 ) -> None:
     """Says what will be made and how long it takes.
 

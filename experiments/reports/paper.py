@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -12,7 +14,7 @@ import numpy as np
 
 FOLDER = Path(__file__).parents[1] / "paper"
 
-# Environment steps of a training run (experiments spec 2).
+# Environment steps of a training run.
 _BUDGETS = {
     "Grid World": 40e6,
     "Recommender": 40e6,
@@ -21,25 +23,20 @@ _BUDGETS = {
 }
 _CREATE_BUDGET = 60e6
 
-# (our method, our representation) -> the paper's method. Both names of a default modality count.
-_METHODS = {
-    ("ours", "hvae"): "ours",
-    ("ours", "hvae-xy"): "ours",
-    ("ours", "hvae-onehot"): "ours_onehot",
-    ("ours", "hvae-state"): "ours",
-    ("ours", "hvae-video"): "ours_video",
-    ("ours", "hvae-image"): "ours",
-    ("ours", "gt12"): "ours_engineered",
-    ("ours", "gt21"): "ours_engineered",
-    ("ours", "gt32"): "ours_engineered",
-    ("ours", "vae"): "vae",
-    ("ours", "vae-xy"): "vae",
-    ("ours", "vae-state"): "vae",
-    ("ours", "vae-image"): "vae",
-    ("ours", "product"): "ours",
-    ("ours", "product-mu"): "ours",
-    ("ours", "hvae-oracle"): "ours_oracle_hvae",
+# Our representation, without the name of a default modality -> the paper's method.
+_OURS = {
+    "hvae": "ours",
+    "product": "ours",
+    "product-mu": "ours",
+    "hvae-onehot": "ours_onehot",
+    "hvae-video": "ours_video",
+    "gt12": "ours_engineered",
+    "gt21": "ours_engineered",
+    "gt32": "ours_engineered",
+    "vae": "vae",
+    "hvae-oracle": "ours_oracle_hvae",
 }
+_DEFAULT_MODALITY = re.compile("(?<=vae)-(xy|state|image)$")
 # Baselines and ablations of the policy, on the default representation of a domain.
 _BASELINES = {
     "no-entropy": "ours_no_entropy",
@@ -47,21 +44,29 @@ _BASELINES = {
     "continuous": "continuous_output",
     "nearest-neighbour": "nearest_neighbor",
 }
-_DEFAULT_REPRESENTATIONS = ("hvae", "hvae-xy", "hvae-state", "hvae-image", "product", "product-mu")
 
 # Where a representation makes the paper's results those of an environment of its own.
 _ENVIRONMENTS = {("Recommender", "product-mu"): "Recommender (fully observable)"}
 # Figure of a split that is not the domain's default, and what it appends to the names of methods.
 _SPLIT_FIGURES = {"full": ("fig7a_create_full_split", "")}
 _SPLIT_FIGURES_OF = {("Shape Stacking", "full"): ("fig23_stacking_variants", "full_split")}
-# Actions in the sets of a bar, where they are not as many as in training (spec method 2.2).
-# Methods whose train curves come from another simulator (experiments spec 15).
+# Methods whose train curves come from another simulator (docs/shape_stacking.md, "Against the paper
+# and its release").
 _OTHER_SIMULATOR = {"Shape Stacking": ("nearest_neighbor", "ours_no_subsampling")}
+# Actions in the sets of a bar, where they are not as many as in training.
 _SET_SIZES = {("Recommender (fully observable)", "test"): 25}
 
 
 class PaperError(ValueError):
     """The paper has no such environment, method, split or figure."""
+
+
+class PaperValue(NamedTuple):
+    """Mean and population standard deviation over the paper's seeds."""
+
+    mean: float
+    std: float
+    num_seeds: int
 
 
 @dataclass(frozen=True)
@@ -74,9 +79,7 @@ class PaperResult:
       method: e.g. `ours`, `vae`.
       split: `train` or `test` actions.
       metric: success_rate (a share in [0, 1]), ctr or final_height.
-      mean, std: over seeds; std is the population's.
-      num_seeds: seeds behind it.
-      source: the released file, or a remark.
+      value: its mean and deviation.
     """
 
     figure: str
@@ -84,18 +87,7 @@ class PaperResult:
     method: str
     split: str
     metric: str
-    mean: float
-    std: float
-    num_seeds: int
-    source: str
-
-
-class PaperValue(NamedTuple):
-    """Mean and population standard deviation over the paper's seeds."""
-
-    mean: float
-    std: float
-    num_seeds: int
+    value: PaperValue
 
 
 class PaperCurve(NamedTuple):
@@ -112,12 +104,11 @@ def paper_method(method: str, representation: str, variant: str = "") -> str | N
     Args:
       method: ours, such as `no-entropy`.
       representation: ours, such as `hvae`.
-      variant: of the domain or of the policy, see `Task.paper_variant`.
+      variant: of the domain or of the policy, see `Presentation.paper_variant`.
     """
-    if method in _BASELINES and representation in _DEFAULT_REPRESENTATIONS:
-        name: str | None = _BASELINES[method]
-    else:
-        name = _METHODS.get((method, representation))
+    name = _OURS.get(_DEFAULT_MODALITY.sub("", representation))
+    if method != "ours":
+        name = _BASELINES.get(method) if name == "ours" else None
     if name is None or not variant:
         return name
     name = f"{name}_{variant}"
@@ -183,13 +174,13 @@ def paper_value(
       PaperError: a name that stands nowhere in the paper.
     """
     rows = paper_results(environment)
-    _check("method", method, dict.fromkeys(row.method for row in _results()))
-    _check("split", split, _splits())
+    _check("method", method, (row.method for row in _results()))
+    _check_split(split)
     if figure is not None:
-        _check("figure", figure, dict.fromkeys(row.figure for row in _results()))
+        _check("figure", figure, (row.figure for row in _results()))
     for row in rows:
         if (row.method, row.split) == (method, split) and figure in (None, row.figure):
-            return PaperValue(row.mean, row.std, row.num_seeds)
+            return row.value
     return None
 
 
@@ -206,9 +197,9 @@ def paper_steps(environment: str) -> float:
 def paper_curve(environment: str, method: str, split: str) -> PaperCurve | None:
     """A learning curve up to the training budget; None if the paper shows none.
 
-    Every seed's curve is held at its maximum after it reached it, as the paper drew them (method
-    spec 11), so that its end is the mean of the seeds' best evaluations. What the released figures
-    draw past the budget is padding and left out.
+    Every seed's curve is held at its maximum after it reached it, as the paper drew them, so that
+    its end is the mean of the seeds' best evaluations. What the released figures draw past the
+    budget is padding and left out.
 
     Args:
       environment: as in `paper_environments`.
@@ -218,15 +209,13 @@ def paper_curve(environment: str, method: str, split: str) -> PaperCurve | None:
     Raises:
       PaperError: a name that stands nowhere in the paper.
     """
-    _check("environment", environment, paper_environments())
-    methods = [row.method for row in _results()] + [key[1] for key in _curves()]
-    _check("method", method, dict.fromkeys(methods))
-    _check("split", split, _splits())
+    end = paper_steps(environment)
+    _check("method", method, [row.method for row in _results()] + [key[1] for key in _curves()])
+    _check_split(split)
     curve = _curves().get((environment, method, split))
     if curve is None:
         return None
-    is_within = curve.steps <= paper_steps(environment)
-    return PaperCurve(*(values[is_within] for values in curve))
+    return PaperCurve(*(values[curve.steps <= end] for values in curve))
 
 
 def is_comparable(environment: str | None, method: str | None, split: str) -> bool:
@@ -234,29 +223,22 @@ def is_comparable(environment: str | None, method: str | None, split: str) -> bo
     return split != "train" or method not in _OTHER_SIMULATOR.get(environment or "", ())
 
 
-def _splits() -> list[str]:
-    names = [row.split for row in _results()] + [key[2] for key in _curves()]
-    return list(dict.fromkeys(names))
+def _check(kind: str, name: str, known: Iterable[str]) -> None:
+    names = list(dict.fromkeys(known))
+    if name not in names:
+        raise PaperError(f"The paper has no {kind} {name!r}; there are: {', '.join(names)}.")
 
 
-def _check(what: str, name: str, known: list[str] | dict[str, None]) -> None:
-    if name not in known:
-        raise PaperError(f"The paper has no {what} {name!r}; there are: {', '.join(known)}.")
+def _check_split(split: str) -> None:
+    _check("split", split, [row.split for row in _results()] + [key[2] for key in _curves()])
 
 
 @lru_cache(maxsize=1)
 def _results() -> list[PaperResult]:
     return [
         PaperResult(
-            figure=row["figure"],
-            environment=row["environment"],
-            method=row["method"],
-            split=row["split"],
-            metric=row["metric"],
-            mean=float(row["mean"]),
-            std=float(row["std"]),
-            num_seeds=int(row["n_seeds"]),
-            source=row["source_note"],
+            *(row["figure"], row["environment"], row["method"], row["split"], row["metric"]),
+            PaperValue(float(row["mean"]), float(row["std"]), int(row["n_seeds"])),
         )
         for row in _rows("results.csv")
     ]

@@ -26,7 +26,7 @@ FAINT_INK = "#7a828f"
 GRID_COLOR = "#e4e6ea"
 PAPER_COLOR = "#5b6472"  # Of the paper's numbers, whatever the method.
 
-_TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # Spec method 11.
+_TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # docs/method.md, "Figures".
 _TEST_HATCH = "///"
 _COVER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
 _ANCHOR_DASHES: tuple[Any, ...] = (":", "-.", "--", "-")
@@ -277,7 +277,7 @@ class Scatter:
 
 
 def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: str = "") -> Figure:
-    """Two-dimensional representations, coloured by class (spec method 11).
+    """Two-dimensional representations, coloured by class.
 
     Args:
       panels: from left to right.

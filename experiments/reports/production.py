@@ -9,17 +9,22 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.pipeline.artifacts import REPRESENTATION_SEED, TABLE_FILE, Domain
-from experiments.pipeline.flags import UsageError, budget_of, load_task
-from experiments.pipeline.machinery import environment_settings, in_group, pool_assignments
-from experiments.pipeline.methods import adapted
-from experiments.reports.runs import Run, read_runs
-from jaxnew.representation.table import RepresentationTable
-from jaxnew.storage import config as config_lib
-from jaxnew.storage.run_directory import RunDirectoryError
-from jaxnew.task import StageTwoBudget
+import numpy as np
 
-_EQUAL = ("num_updates", "hyperparameters", "ppo")  # Fields that make runs the same setting.
+from experiments.reports.runs import RunRecord, read_runs
+from jaxnew.embedding import REPRESENTATION_SEED, TABLE_FILE
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.storage.config import ConfigError
+from jaxnew.storage.run_directory import RunDirectoryError
+from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import TrainConfig, identity, with_set
+from jaxnew.training import train_config
+
+# Fields in which runs of one setting may differ. The split is told by its hash, and the
+# representation by what it is called today.
+_FREE = ("task", "split", "split_seed", "seed", "representation", "table_hash", "loop")
+_ANY_TABLE = RepresentationTable(np.zeros((1, 1), np.float32), np.zeros(1, np.int32))
 
 
 @dataclass(frozen=True)
@@ -51,6 +56,11 @@ class Cell:
         ]
         return ", ".join(word for word in words if word)
 
+    @property
+    def assignments(self) -> tuple[str, ...]:
+        """Those of `--set` that make it what it is."""
+        return ("conditions_position=true",) if self.conditions_position else ()
+
 
 @dataclass(frozen=True)
 class Source:
@@ -80,12 +90,26 @@ class Source:
     given: Mapping[str, Path]
     workers: int = 0
 
+    @classmethod
+    def asked_for(cls, flags: Any, given: Mapping[str, Path] | None = None) -> Source:
+        """What the flags of a command say; `flags` are its `Arguments`."""
+        return cls(
+            domain=Domain.of(load_task(flags.task), flags.split, flags.split_seed),
+            folder=Path(flags.runs),
+            budget=flags.budget,
+            stage_one=flags.representation_budget or flags.budget,
+            steps=flags.steps,
+            seeds=tuple(map(int, flags.seeds)),
+            assignments=tuple(flags.set),
+            given=given or {},
+            workers=flags.workers,
+        )
+
     def of(self, cell: Cell) -> Source:
         """Where the runs of a cell come from: those of its own task and split.
 
         Raises:
-          UsageError: there is no such variant of the task.
-          ValueError: it has no such split.
+          UsageError: there is no such variant of the task, or no such split of it.
         """
         task, split = self.domain.task, cell.split or self.domain.split_name
         if cell.variant:
@@ -98,24 +122,19 @@ class Source:
         if words:
             end = f"@{'-'.join(words)}"
             given = {k.removesuffix(end): path for k, path in given.items() if k.endswith(end)}
-        return replace(self, domain=Domain.of(task, split), given=given)
+        domain = Domain.of(task, split, self.domain.split_seed)
+        return replace(self, domain=domain, given=given)
 
-    def budget_of(self, method: str) -> StageTwoBudget:
-        """What a run of the method spends."""
-        task = self.domain.task
-        budget = budget_of(task.stage_two, self.budget, "Stage two")
-        budget = adapted(budget, method, task, self.domain.split)
-        budget = config_lib.set_paths(budget, self.budget_assignments)
+    def config_of(self, cell: Cell) -> TrainConfig:
+        """The config of a run of a cell, but for its seed and its table."""
+        preset = self.domain.task.budget(self.budget)
+        names = cell.method, cell.representation
+        config = train_config(self.domain, *names, _ANY_TABLE, preset, seed=0)
+        config = with_set(config, [*self.assignments, *cell.assignments])
         if self.steps:
-            updates = math.ceil(self.steps / budget.ppo.steps_per_update)
-            budget = replace(budget, num_updates=updates)
-        return budget
-
-    @property
-    def budget_assignments(self) -> list[str]:
-        """Those that are not about environments or pools."""
-        _, others = in_group(self.assignments, "environment")
-        return pool_assignments(others)[1]
+            updates = math.ceil(self.steps / config.ppo.steps_per_update)
+            config = replace(config, num_updates=updates)
+        return config
 
     def table_of(self, representation: str) -> RepresentationTable | None:
         """The table that was given for a representation; None if none was."""
@@ -124,67 +143,54 @@ class Source:
             return None
         return RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
 
-    def representation_flag(self, representation: str) -> str:
-        """What `--representation` must be."""
-        return str(self.given.get(representation, representation))
-
     def embed_folder(self, representation: str) -> Path:
         """Where `embed` keeps a representation."""
-        name = f"embed-{representation}-{self.domain.split_name}-{self.stage_one}"
+        name = f"embed-{representation}-{self.domain.split_label}-{self.stage_one}"
         return self.domain.actions_folder(self.folder) / f"{name}-{REPRESENTATION_SEED}"
 
 
-def find(source: Source, cell: Cell) -> dict[int, Run]:
+def find(source: Source, cell: Cell) -> dict[int, RunRecord]:
     """The finished runs of a cell, by seed.
 
     Raises:
       UsageError: two runs of one seed fit, so that it is not clear which one is meant.
     """
-    wanted = _plain(source.budget_of(cell.method))
-    environment = environment_settings(source.assignments)
+    wanted = _setting(identity(source.config_of(cell)))
     table = source.table_of(cell.representation)
-    found: dict[int, Run] = {}
-    for run in policies(source.domain.folder(source.folder)):
-        config = run.config
+    found: dict[int, RunRecord] = {}
+    for run in policies_below(source.domain.folder(source.folder)):
+        config, seed = run.config, int(run.config["seed"])
         is_wanted = (
-            config["method"] == cell.method
-            and config["trained_on"] == "train"
-            and not config.get("num_clusters", 0)
-            and bool(config.get("conditions_position", False)) == cell.conditions_position
-            and config["split_hash"] == source.domain.split.hash
-            and run.representation == cell.representation
-            and _plain(config) == wanted
-            and tuple(config.get("environment", ())) == environment
-            and config["seed"] in source.seeds
+            seed in source.seeds
+            and _setting(config) == wanted
             and (table is None or config["table_hash"] == table.hash)
+            and run.table is not None
+            and run.representation == cell.representation
             and run.is_finished
         )
-        if not is_wanted:
-            continue
-        seed = int(config["seed"])
-        if seed in found:
+        if is_wanted and seed in found:
             raise UsageError(
                 f"{found[seed].path} and {run.path} are both {cell.method} on "
                 f"{cell.representation} with seed {seed}; move one of them away, or name the table "
                 f"that you mean with --given={cell.representation}=TABLE."
             )
-        found[seed] = run
+        if is_wanted:
+            found[seed] = run
     return found
 
 
-def policies(folder: Path) -> list[Run]:
+def policies_below(folder: Path) -> list[RunRecord]:
     """Every readable policy run below a folder; members of sweeps are runs."""
     runs = []
     for file in sorted(folder.rglob("config.json")):
         if "members.partial" in file.parts:  # Of a sweep that is being written.
             continue
-        with suppress(UsageError, RunDirectoryError):
+        with suppress(UsageError, ConfigError, RunDirectoryError):
             runs += [run for run in read_runs([file.parent]) if run.path == file.parent.resolve()]
-    return [run for run in runs if run.is_policy and run.table is not None]
+    return [run for run in runs if run.is_policy]
 
 
-def _plain(config: Any) -> dict[str, Any]:
+def _setting(config: Mapping[str, Any]) -> dict[str, Any]:
     """The fields by which runs are the same setting; how a gradient is cut up is none of them."""
-    plain = config if isinstance(config, dict) else config_lib.to_dict(config)
-    fields = {name: plain[name] for name in _EQUAL}
-    return {**fields, "ppo": {**fields["ppo"], "microbatch_size": 0}}
+    kept = {name: value for name, value in config.items() if name not in _FREE}
+    return {**kept, "ppo": {**kept["ppo"], "microbatch_size": 0}}

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 import numpy as np
 
+from experiments.reports import tables
 from experiments.reports.paper import PaperValue, paper_steps, paper_value
 from experiments.reports.plots import Metric
-from experiments.reports.runs import Group, Run
+from experiments.reports.runs import Group, RunRecord
 from jaxnew.actions import SPLIT_NAMES
 
 RANDOM_PLAY = "random-play"  # What `demo` records in place of a checkpoint.
@@ -71,7 +70,7 @@ class ResultRow:
 
 def result_rows(group: Group) -> list[ResultRow]:
     """Every evaluation of the group's runs, over the seeds that have it."""
-    found: dict[tuple[Any, ...], list[tuple[Run, dict[str, Any]]]] = {}
+    found: dict[tuple[Any, ...], list[tuple[RunRecord, dict[str, Any]]]] = {}
     for run in group.runs:
         for e in run.evaluations:
             if group.task.selection_metric in e["metrics"]:
@@ -90,7 +89,7 @@ def result_rows(group: Group) -> list[ResultRow]:
     )
 
 
-def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> ResultRow:
+def _result_row(group: Group, evaluations: list[tuple[RunRecord, dict[str, Any]]]) -> ResultRow:
     """One row from the same evaluation of each seed."""
     runs = [run for run, _ in evaluations]
     first = evaluations[0][1]
@@ -125,25 +124,20 @@ def _result_row(group: Group, evaluations: list[tuple[Run, dict[str, Any]]]) -> 
             np.mean([e["step"] * run.steps_per_update for run, e in evaluations])
         ),
         trained_steps=float(np.mean([run.trained_steps for run in runs])),
-        paper_method=group.paper_method if paper else None,
-        paper_mean=paper.mean if paper else None,
-        paper_std=paper.std if paper else None,
-        paper_num_seeds=paper.num_seeds if paper else None,
-        paper_steps=paper_steps(str(group.paper_environment)) if paper else None,
-        difference=scale * (mean - paper.mean) if paper else None,
+        paper_method=paper and group.paper_method,
+        paper_mean=paper and paper.mean,
+        paper_std=paper and paper.std,
+        paper_num_seeds=paper and paper.num_seeds,
+        paper_steps=paper and paper_steps(str(group.paper_environment)),
+        difference=paper and scale * (mean - paper.mean),
         runs=tuple(str(run.path) for run in runs),
     )
 
 
 def is_standard(group: Group, evaluation: dict[str, Any]) -> bool:
     """Whether an evaluation of a run of the group was made as the paper's."""
-    if "first_size" in evaluation or evaluation["actions"] not in SPLIT_NAMES:
-        return False
-    wanted = group.set_size(evaluation["actions"])
-    is_whole = evaluation["set_size"] == evaluation.get("num_actions")
-    return (evaluation["checkpoint"], evaluation["policy"]) == ("best", "sampled") and (
-        is_whole if wanted is None else evaluation["set_size"] == wanted
-    )
+    part = evaluation["actions"]
+    return part in SPLIT_NAMES and group.standard(part).is_answered_by(evaluation)
 
 
 def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
@@ -157,53 +151,49 @@ def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
 
 def as_csv(rows: Sequence[ResultRow]) -> str:
     """The rows with all fields; an unknown number is empty, `;` stands between several runs."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [f.name for f in fields(ResultRow)], lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({**asdict(row), "runs": ";".join(row.runs)} for row in rows)
-    return text.getvalue()
+    plain = [{**asdict(row), "runs": ";".join(row.runs)} for row in rows]
+    return tables.csv_text(plain, [f.name for f in fields(ResultRow)])
 
 
 def as_markdown(title: str, rows: Sequence[ResultRow], metric: Metric, notes: Sequence[str]) -> str:
     """The rows for reading, and what their numbers are."""
     header = ["setting", "actions", "policy", "ours", "paper", "difference", "seeds"]
     header += ["episodes", "steps (million)", "run"]
-    lines = [f"# {title}: {metric.name.lower()}", ""]
-    lines += [_line(header), _line(["---"] * len(header))]
-    lines += [_line(_cells(row, metric)) for row in rows]
-    lines += [
+    points = ", in percentage points" if metric.unit == "%" else ""
+    lines = [
+        *(f"# {title}: {metric.name.lower()}", ""),
+        *tables.table(header, [_cells(row, metric) for row in rows]),
         "",
         "Ours: [low, high] is the 95 % interval over the episodes of one run; ± is the population "
         "standard deviation over seeds, as in the paper, whose numbers are 5,000 sampled episodes "
         "per seed. Seeds and steps: ours / the paper's; episodes are per seed. Steps are those "
         "that a run was trained for; the checkpoint is the best one by validation."
-        " Difference: ours minus the paper's"
-        + (", in percentage points." if metric.unit == "%" else "."),
+        f" Difference: ours minus the paper's{points}.",
+        *(f"\n{note}" for note in notes),
     ]
-    lines += [f"\n{note}" for note in notes]
     return "\n".join(lines) + "\n"
 
 
 def _cells(row: ResultRow, metric: Metric) -> list[str]:
+    """A row for reading."""
+    is_random = row.checkpoint == RANDOM_PLAY
     error = f"[{metric.text(row.low)}, {metric.text(row.high)}]"
     if row.num_seeds > 1:
         error = f"± {metric.text(row.high - row.mean)}"
-    policy = "random play" if row.checkpoint == RANDOM_PLAY else f"{row.policy}, {row.checkpoint}"
     paper = difference = "-"
-    seeds, steps = str(row.num_seeds), f"{1e-6 * row.trained_steps:.3g}"
-    if row.checkpoint == RANDOM_PLAY:
-        steps = "-"
+    seeds, steps = str(row.num_seeds), "-" if is_random else f"{1e-6 * row.trained_steps:.3g}"
     if row.paper_mean is not None and row.paper_std is not None and row.paper_steps is not None:
         paper = f"{metric.text(row.paper_mean)} ± {metric.text(row.paper_std)}"
         difference = f"{row.difference:+.1f}" if metric.unit == "%" else f"{row.difference:+.3f}"
         seeds += f" / {row.paper_num_seeds}"
         steps += f" / {1e-6 * row.paper_steps:.3g}"
-    ours = f"{metric.text(row.mean)} {error}"
-    actions = f"{row.actions}, sets of {row.set_size}"
-    episodes = f"{row.num_episodes:,}"
-    cells = [row.setting, actions, policy, ours, paper, difference, seeds, episodes, steps]
-    return [*cells, "<br>".join(row.runs)]
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return [
+        row.setting,
+        f"{row.actions}, sets of {row.set_size}",
+        "random play" if is_random else f"{row.policy}, {row.checkpoint}",
+        f"{metric.text(row.mean)} {error}",
+        *(paper, difference, seeds),
+        f"{row.num_episodes:,}",
+        steps,
+        "<br>".join(row.runs),
+    ]

@@ -6,14 +6,13 @@ import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.pipeline.artifacts import SPLIT_FILE, TABLE_FILE
-from experiments.pipeline.flags import UsageError, load_task
 from experiments.reports.paper import (
     paper_environment,
     paper_figure_of_split,
@@ -23,44 +22,65 @@ from experiments.reports.paper import (
 )
 from experiments.reports.plots import Metric
 from jaxnew.actions import ActionSplit
+from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.storage.config import differences
+from jaxnew.run import Question
+from jaxnew.storage.config import differences, plain
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task import Task
+from jaxnew.task.domain import load_task
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import upgraded
+from jaxnew.task.task import Task
 
 # Fields that tell settings of one method and representation apart in a label, most telling first.
 _LABEL_ORDER = (
-    "task",
-    "split",
-    "split_hash",
-    "table_hash",
-    "hyperparameters",
-    "num_updates",
-    "ppo",
+    *("task", "split", "split_seed", "split_hash", "table_hash"),
+    *("hyperparameters", "num_updates", "ppo", "sets", "environment"),
 )
 _LABEL_CHANGES = 2
 
 
 @dataclass(frozen=True)
-class Run:
-    """What one run directory holds.
+class RunRecord:
+    """What one run directory holds; its files are read when they are first asked for.
 
     Attributes:
       path: the directory.
-      config: its plain configuration.
-      reports: the lines of `metrics.jsonl`.
-      evaluations: what `evaluate` wrote.
-      table, split: the representations and the split of the run; None if it was interrupted before
-        it had them.
+      config: its plain configuration in today's form.
     """
 
     path: Path
     config: dict[str, Any]
-    reports: list[dict[str, Any]]
-    evaluations: list[dict[str, Any]]
-    table: RepresentationTable | None
-    split: ActionSplit | None
+
+    @cached_property
+    def reports(self) -> list[dict[str, Any]]:
+        """The lines of `metrics.jsonl`."""
+        return read(self.path)
+
+    @cached_property
+    def evaluations(self) -> list[dict[str, Any]]:
+        """What `Run.evaluate` recorded.
+
+        Raises:
+          UsageError: a file is damaged.
+        """
+        found = [_read_evaluation(file) for file in sorted(self.path.glob("evaluation/*.json"))]
+        return [e for e in found if "actions" in e and "metrics" in e]
+
+    @cached_property
+    def table(self) -> RepresentationTable | None:
+        """Its representations; None if it was interrupted before it had them."""
+        return RepresentationTable.load(self.path / TABLE_FILE) if self._has_inputs else None
+
+    @cached_property
+    def split(self) -> ActionSplit | None:
+        """Its split, as `table`."""
+        return ActionSplit.load(self.path / SPLIT_FILE) if self._has_inputs else None
+
+    @property
+    def _has_inputs(self) -> bool:
+        return (self.path / TABLE_FILE).exists() and (self.path / SPLIT_FILE).exists()
 
     @property
     def is_policy(self) -> bool:
@@ -79,6 +99,11 @@ class Run:
         return self.steps_per_update * max((r["step"] for r in self.reports), default=0)
 
     @property
+    def is_finished(self) -> bool:
+        """All its updates are done."""
+        return self.trained_steps >= self.config["num_updates"] * self.steps_per_update
+
+    @property
     def representation(self) -> str:
         """`hvae`, `gt12`, ...: also where the run was given a directory or a file of vectors."""
         given = str(self.config["representation"])
@@ -87,16 +112,15 @@ class Run:
         made = self.table.source.split(",")[0].removeprefix("engineered:") if self.table else ""
         return made if re.fullmatch(r"[\w-]+", made) else Path(given).stem
 
-    @property
-    def is_finished(self) -> bool:
-        """All its updates are done."""
-        return self.trained_steps >= self.config["num_updates"] * self.steps_per_update
-
     def curve(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Environment steps and values f64[n] of an evaluated metric, e.g. `train/is_success`."""
         points = [(r["step"], r[name]) for r in self.reports if r.get(name) is not None]
         steps, values = np.array(points, np.float64).reshape(-1, 2).T
         return steps * self.steps_per_update, values
+
+    def answer(self, question: Question, episodes: int = 1) -> dict[str, Any] | None:
+        """The evaluation on record that answers a question with enough episodes; None without."""
+        return next((e for e in self.evaluations if question.is_answered_by(e, episodes)), None)
 
 
 @dataclass(frozen=True)
@@ -111,7 +135,7 @@ class Group:
 
     label: str
     task: Task
-    runs: tuple[Run, ...]
+    runs: tuple[RunRecord, ...]
 
     @property
     def config(self) -> dict[str, Any]:
@@ -126,7 +150,12 @@ class Group:
     @property
     def paper_environment(self) -> str | None:
         """Where the paper reports on this task and representation; None if it does not."""
-        return paper_environment(self.task.paper_environment, self.representation)
+        return paper_environment(self.task.shown.paper_environment, self.representation)
+
+    @property
+    def place(self) -> str:
+        """The paper's name of where the runs were, or the task's."""
+        return self.paper_environment or self.task.name
 
     @property
     def paper_method(self) -> str | None:
@@ -134,17 +163,20 @@ class Group:
         is_shown = self.is_default_split or self._paper_split is not None
         if self.paper_environment is None or not is_shown or self.is_ours_alone:
             return None
-        conditioned = "conditioned_auxiliary" if self.config.get("conditions_position") else ""
+        conditioned = "conditioned_auxiliary" if self.config["conditions_position"] else ""
         of_split = self._paper_split[1] if self._paper_split else ""
-        words = (self.task.paper_variant, conditioned, of_split)
+        words = (self.task.shown.paper_variant, conditioned, of_split)
         variant = "_".join(word for word in words if word)
         return paper_method(self.config["method"], self.representation, variant)
 
     @property
     def is_ours_alone(self) -> bool:
         """Trained in a way that the paper has no bars of."""
-        options = ("num_clusters", "environment")
-        return self.is_finetuned or any(self.config.get(option) for option in options)
+        return (
+            self.config["trained_on"] != "train"
+            or bool(self.config["num_clusters"])
+            or self.config["environment"] != plain(self.task.environment)
+        )
 
     @property
     def is_default_split(self) -> bool:
@@ -164,11 +196,6 @@ class Group:
         return paper_figure_of_split(self.paper_environment, self.config["split"])
 
     @property
-    def is_finetuned(self) -> bool:
-        """Trained with other actions than those of the train split."""
-        return bool(self.config["trained_on"] != "train")
-
-    @property
     def metric(self) -> Metric:
         """How the task's selection metric is shown."""
         if self.paper_environment is None:
@@ -176,55 +203,48 @@ class Group:
         published = paper_results(self.paper_environment)[0].metric
         return Metric.of(self.task.selection_metric, published)
 
-    def set_size(self, actions: str) -> int | None:
-        """Actions in the sets of a standard evaluation; None for all that training had at once."""
-        rollout = self.config["ppo"]["rollout"]
-        if rollout["has_fixed_set"] and actions == self.config["trained_on"]:
-            return None
-        return paper_set_size(self.paper_environment, actions, int(rollout["set_size"]))
+    def standard(self, part: str) -> Question:
+        """What the paper asked of such runs on a part of the split.
+
+        Sets are of its size, or all that training had at once.
+        """
+        sets = self.config["sets"]
+        if sets["is_fixed"] and part == self.config["trained_on"]:
+            return Question(part, None)
+        return Question(part, paper_set_size(self.paper_environment, part, int(sets["size"])))
 
 
-def read_runs(paths: Sequence[Path]) -> list[Run]:
+def read_runs(paths: Sequence[Path]) -> list[RunRecord]:
     """The runs at `paths`; a sweep stands for its members, a path given twice counts once.
 
     Raises:
       UsageError: no path, or one of a kind that has no figures.
       RunDirectoryError: a path is no run directory, or it is damaged.
     """
-    runs: dict[Path, Run] = {}
+    runs: dict[Path, RunRecord] = {}
     for path in paths:
-        members = _members(path)
-        for run_path in [path] if members is None else members:
+        for run_path in _members(path) or [path]:
             runs.setdefault(run_path.resolve(), _read_run(run_path))
     if not runs:
-        raise UsageError("Say which runs to draw: --run=DIRECTORY[,DIRECTORY...].")
+        raise UsageError("Say which runs: --run=DIRECTORY[,DIRECTORY...].")
     return list(runs.values())
 
 
-def _members(path: Path) -> list[Path] | None:
-    """The member directories of a sweep; None for another run."""
+def _members(path: Path) -> list[Path]:
+    """The member directories of a sweep; none of another run."""
     if "members" not in RunDirectory.load(path).config:
-        return None
+        return []
     members = sorted(p.parent for p in path.glob("members/*/config.json"))
     if not members:
         raise UsageError(f"The sweep {path} has written no members yet; run it to its end.")
     return members
 
 
-def _read_run(path: Path) -> Run:
+def _read_run(path: Path) -> RunRecord:
     config = RunDirectory.load(path).config
     if "representation" not in config or not ("ppo" in config or "model" in config):
         raise UsageError(f"{path} is no run of train, sweep or embed, so there is nothing to draw.")
-    has_inputs = (path / TABLE_FILE).exists() and (path / SPLIT_FILE).exists()
-    evaluations = [_read_evaluation(file) for file in sorted(path.glob("evaluation/*.json"))]
-    return Run(
-        path=path,
-        config=config,
-        reports=read(path),
-        evaluations=[e for e in evaluations if "actions" in e and "metrics" in e],
-        table=RepresentationTable.load(path / TABLE_FILE) if has_inputs else None,
-        split=ActionSplit.load(path / SPLIT_FILE) if has_inputs else None,
-    )
+    return RunRecord(path, upgraded(config))
 
 
 def _read_evaluation(file: Path) -> dict[str, Any]:
@@ -234,13 +254,25 @@ def _read_evaluation(file: Path) -> dict[str, Any]:
         raise UsageError(f"{file} is damaged ({err}); delete it and evaluate again.") from err
 
 
-def group_runs(runs: Sequence[Run]) -> list[Group]:
+def policies(paths: Sequence[Path]) -> list[RunRecord]:
+    """Those of `read_runs` that are of policies.
+
+    Raises:
+      UsageError: there is none, or see `read_runs`.
+    """
+    found = [run for run in read_runs(paths) if run.is_policy]
+    if not found:
+        raise UsageError(f"This needs a run of train; {', '.join(map(str, paths))} are of embed.")
+    return found
+
+
+def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
     """Runs of `train` with equal configurations but for the seed, in the order given.
 
     Raises:
       UsageError: two runs of a group have the same seed, so that they are not two samples.
     """
-    by_config: dict[str, list[Run]] = {}
+    by_config: dict[str, list[RunRecord]] = {}
     for run in runs:
         key = json.dumps({**run.config, "seed": None}, sort_keys=True)
         by_config.setdefault(key, []).append(run)

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from experiments.pipeline import flags as flag
-from experiments.pipeline.artifacts import Domain
-from experiments.pipeline.methods import file_name
 from experiments.reports.jobs import Job, announce, sweep_job, train_job
 from experiments.reports.production import Cell, Source
-from experiments.reports.runs import Group, Run, group_runs, read_runs
+from experiments.reports.runs import RunRecord, group_runs, read_runs
 from experiments.reports.study_report import Study, StudyPoint
-from jaxnew.storage.run_directory import RunDirectoryError
+from jaxnew.ppo import PPOConfig
+from jaxnew.task.methods import file_name
+from jaxnew.task.places import UsageError
 
 
 @dataclass(frozen=True)
@@ -26,57 +25,41 @@ class Grid:
     Attributes:
       axis: what its values are.
       values: the paper's.
-      sources: `(source, method, values) ->` for each value, what its runs are made from.
+      assignment: `(PPOConfig of the preset, value) ->` what `--set` sets.
       value_of: what a run's plain config has on the axis.
       traced: the hyper-parameter whose values one program can hold; None if they are shapes.
     """
 
     axis: str
     values: tuple[float, ...]
-    sources: Callable[[Source, str, Sequence[float]], list[Source]]
-    value_of: Callable[[dict[str, Any]], float]
+    assignment: Callable[[PPOConfig, float], str]
+    value_of: Callable[[Mapping[str, Any]], float]
     traced: str | None = None
 
+    def source(self, source: Source, cell: Cell, value: float) -> Source:
+        """Where the runs of a value come from; they take as many steps as all others.
 
-def entropy_sources(source: Source, method: str, values: Sequence[float]) -> list[Source]:
-    """Sources that differ in the entropy coefficient."""
-    del method
-    return [
-        _with(source, f"hyperparameters.entropy_coefficient={value:g}", source.steps)
-        for value in values
-    ]
-
-
-def batch_size_sources(source: Source, method: str, values: Sequence[float]) -> list[Source]:
-    """Sources with other minibatches: longer rollouts make larger ones, steps stay the same.
-
-    Raises:
-      UsageError: a minibatch is no whole number of steps of the environments.
-    """
-    preset = source.budget_of(method)
-    steps = source.steps or float(preset.num_updates * preset.ppo.steps_per_update)
-    num_envs, num_minibatches = preset.ppo.rollout.num_envs, preset.ppo.num_minibatches
-    found = []
-    for value in values:
-        num_steps, rest = divmod(int(value) * num_minibatches, num_envs)
-        if rest or not num_steps:
-            raise flag.UsageError(
-                f"Minibatches of {value:g} are no whole number of steps: a rollout of {num_envs} "
-                f"environments is cut into {num_minibatches}."
-            )
-        found.append(_with(source, f"ppo.rollout.num_steps={num_steps}", steps))
-    return found
+        Raises:
+          UsageError: no run can have such a value.
+        """
+        config = source.config_of(cell)
+        steps = float(config.num_updates * config.ppo.steps_per_update)
+        assignments = (*source.assignments, self.assignment(config.ppo, value))
+        return replace(source, steps=source.steps or steps, assignments=assignments)
 
 
-def _with(source: Source, assignment: str, steps: float) -> Source:
-    return replace(source, steps=steps, assignments=(*source.assignments, assignment))
+def _batch_size(ppo: PPOConfig, value: float) -> str:
+    """Longer rollouts make larger minibatches."""
+    num_steps, rest = divmod(int(value) * ppo.num_minibatches, ppo.rollout.num_envs)
+    if rest or not num_steps:
+        raise UsageError(
+            f"Minibatches of {value:g} are no whole number of steps: a rollout of "
+            f"{ppo.rollout.num_envs} environments is cut into {ppo.num_minibatches}."
+        )
+    return f"ppo.rollout.num_steps={num_steps}"
 
 
-def _entropy_of(config: dict[str, Any]) -> float:
-    return float(config["hyperparameters"]["entropy_coefficient"])
-
-
-def _batch_size_of(config: dict[str, Any]) -> float:
+def _batch_size_of(config: Mapping[str, Any]) -> float:
     rollout = config["ppo"]["rollout"]
     return float(rollout["num_envs"] * rollout["num_steps"] / config["ppo"]["num_minibatches"])
 
@@ -85,86 +68,50 @@ GRIDS = {
     "entropy": Grid(
         "entropy coefficient",
         (0.0001, 0.001, 0.005, 0.01, 0.05, 0.1),
-        entropy_sources,
-        _entropy_of,
+        lambda ppo, value: f"hyperparameters.entropy_coefficient={value:g}",
+        lambda config: float(config["hyperparameters"]["entropy_coefficient"]),
         traced="entropy_coefficient",
     ),
     "batch-size": Grid(
-        "transitions per minibatch",
-        (1024, 2048, 3072, 4096),
-        batch_size_sources,
-        _batch_size_of,
+        "transitions per minibatch", (1024, 2048, 3072, 4096), _batch_size, _batch_size_of
     ),
 }
 
 
-@dataclass(frozen=True)
-class Part:
-    """A command of a search, and the folder of the run or of the sweep that it makes."""
-
-    job: Job
-    folder: Path
-
-    @property
-    def is_finished(self) -> bool:
-        """Whether all its runs are done."""
-        try:
-            runs = read_runs([self.folder])
-        except (flag.UsageError, RunDirectoryError):  # Not begun, or a sweep that is not over.
-            return False
-        return all(run.is_finished for run in runs)
-
-
-def search_parts(name: str, source: Source, cell: Cell, values: Sequence[float]) -> list[Part]:
+def search_jobs(name: str, source: Source, cell: Cell, values: Sequence[float]) -> list[Job]:
     """The commands of a search.
 
     On the host every value and seed is a run of its own. Inside jit a value is a program, and all
     of them are one where they are traced.
     """
-    grid = GRIDS[name]
-    budget = source.budget_of(cell.method)
-    seeds = "-".join(map(str, source.seeds))
+    grid, seeds, is_host = GRIDS[name], source.seeds, source.domain.task.host is not None
     words = ["search", name, file_name(cell.method), Path(cell.representation).stem, source.budget]
-    folder = source.domain.folder(source.folder) / "-".join([*words, str(budget.num_updates)])
-    by_value = dict(zip(values, grid.sources(source, cell.method, values), strict=True))
-    if source.domain.task.host is not None:
-        return [
-            Part(_named(train_job(own, cell, seed, place), grid, value), place)
-            for value, own in by_value.items()
-            for seed in source.seeds
-            for place in [folder / f"{value:g}-{seed}"]
-        ]
-    if grid.traced:
-        place = folder / f"all-{seeds}"
+    updates = str(source.config_of(cell).num_updates)
+    folder = source.domain.folder(source.folder) / "-".join([*words, updates])
+    all_seeds = "-".join(map(str, seeds))
+    if grid.traced and not is_host:
         vary = [f"{grid.traced}={','.join(f'{value:g}' for value in values)}"]
-        return [Part(sweep_job(source, cell, source.seeds, place, vary), place)]
-    return [
-        Part(_named(sweep_job(own, cell, source.seeds, place), grid, value), place)
-        for value, own in by_value.items()
-        for place in [folder / f"{value:g}-{seeds}"]
-    ]
-
-
-def _named(job: Job, grid: Grid, value: float) -> Job:
-    return replace(job, title=f"{grid.axis} {value:g}: {job.title}")
+        return [sweep_job(source, cell, seeds, folder / f"all-{all_seeds}", vary)]
+    jobs = []
+    for value in values:
+        own, place = grid.source(source, cell, value), f"{value:g}"
+        if is_host:
+            found = [train_job(own, cell, seed, folder / f"{place}-{seed}") for seed in seeds]
+        else:
+            found = [sweep_job(own, cell, seeds, folder / f"{place}-{all_seeds}")]
+        jobs += [replace(job, title=f"{grid.axis} {place}: {job.title}") for job in found]
+    return jobs
 
 
 def search(
-    name: str,
-    seeds: Sequence[int],
-    steps: float,
-    values: Sequence[float],
-    stage_one: str | None = None,
-    is_dry: bool = False,
+    name: str, source: Source, cell: Cell, values: Sequence[float] = (), is_dry: bool = False
 ) -> Study | None:
     """Trains every value of a grid with every seed; the best by validation is named.
 
     Args:
       name: of the grid.
-      seeds: of the runs.
-      steps: environment steps of every run; 0 for those of the preset.
+      source, cell: what is trained, but for the grid's value.
       values: of the grid; none for the paper's.
-      stage_one: budget of a representation that is to be trained; None for that of the runs.
       is_dry: only says what is missing and how long it takes.
 
     Returns:
@@ -174,50 +121,30 @@ def search(
       UsageError: a value cannot be trained, or a command was stopped.
     """
     grid = GRIDS[name]
-    source = Source(
-        domain=Domain.of(flag.load_task(flag.TASK.value), flag.SPLIT.value),
-        folder=Path(flag.RUNS.value),
-        budget=flag.BUDGET.value,
-        stage_one=stage_one or flag.BUDGET.value,
-        steps=steps,
-        seeds=tuple(seeds),
-        assignments=tuple(flag.SET.value),
-        given={},
-        workers=flag.WORKERS.value,
-    )
-    cell = Cell(flag.METHOD.value, flag.REPRESENTATION.value)
-    parts = search_parts(name, source, cell, tuple(values or grid.values))
-    missing = [part for part in parts if not part.is_finished]
-    announce([part.job for part in missing], 0, None)
+    jobs = search_jobs(name, source, cell, tuple(values or grid.values))
+    missing = [job for job in jobs if not job.is_done]
+    announce(missing)
     if is_dry:
         return None
-    for part in missing:
-        part.job.run()
-        if not part.is_finished:
-            raise flag.UsageError(
-                f"{part.folder} is not finished; call the same command again to go on."
-            )
-    return chosen(name, grid, read_runs([part.folder for part in parts]))
+    for job in missing:
+        job.run()
+        if not job.is_done:
+            raise UsageError(f"{job.folder} is not finished; call the same command again to go on.")
+    return chosen(name, grid, read_runs([job.folder for job in jobs]))
 
 
-def chosen(name: str, grid: Grid, runs: Sequence[Run]) -> Study:
+def chosen(name: str, grid: Grid, runs: Sequence[RunRecord]) -> Study:
     """The runs of a search as a study of their best evaluations on validation sets."""
     groups = sorted(group_runs(runs), key=lambda group: grid.value_of(group.config))
-    points = [
-        StudyPoint(
-            group.label.split(",")[0], grid.value_of(group.config), best_validations(group), 0
-        )
-        for group in groups
-    ]
+    points = []
+    for group in groups:
+        curves = [run.curve(f"validation/{group.task.selection_metric}")[1] for run in group.runs]
+        best_of_each = np.array([curve.max() for curve in curves])
+        method = group.label.split(",")[0]
+        points.append(StudyPoint(method, grid.value_of(group.config), best_of_each, 0))
     best = max(points, key=lambda point: float(point.means.mean()))
     note = (
         f"Best evaluation on validation sets during training, mean over {len(best.means)} seeds. "
         f"Chosen by it: {grid.axis} {best.x:g}."
     )
     return Study(name, grid.axis, name == "entropy", groups[0].metric, tuple(points), note)
-
-
-def best_validations(group: Group) -> np.ndarray:
-    """f64[n] the best value on validation sets of each run."""
-    name = f"validation/{group.task.selection_metric}"
-    return np.array([run.curve(name)[1].max() for run in group.runs])

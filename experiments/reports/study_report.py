@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
 
-from experiments.reports import plots
+from experiments.reports import plots, tables
 from experiments.reports.paper import PaperValue
 from experiments.reports.plots import Metric
 
@@ -76,40 +74,43 @@ class Study:
 
 def write_study(study: Study, out: Path, stem: str, pdf: bool = False) -> list[Path]:
     """The study as a picture and as two tables called `stem`; prints the one for reading."""
-    out.mkdir(parents=True, exist_ok=True)
     text = as_markdown(study)
     print(text)
-    (out / f"{stem}.md").write_text(text, encoding="utf-8")
-    (out / f"{stem}.csv").write_text(as_csv(study), encoding="utf-8")
-    figures = plots.save(study_figure(study), out / f"{stem}.png", pdf)
-    return [*figures, out / f"{stem}.md", out / f"{stem}.csv"]
+    written = tables.write(out, stem, text, as_csv(study))
+    return [*plots.save(study_figure(study), out / f"{stem}.png", pdf), *written]
 
 
 def as_csv(study: Study) -> str:
     """One line per setting and value."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    titles = ["study", "setting", study.axis, "mean", "std", "num_seeds", "num_episodes"]
-    writer.writerow([*titles, "paper", "paper_std", "paper_num_seeds"])
+    rows = []
     for point in study.points:
-        numbers = [float(point.means.mean()), float(point.means.std()), len(point.means)]
-        line = [study.name, point.setting, point.x, *numbers, point.num_episodes]
-        writer.writerow([*line, *(point.paper or ("", "", ""))])
-    return text.getvalue()
+        paper = point.paper
+        rows.append(
+            {
+                "study": study.name,
+                "setting": point.setting,
+                study.axis: point.x,
+                "mean": float(point.means.mean()),
+                "std": float(point.means.std()),
+                "num_seeds": len(point.means),
+                "num_episodes": point.num_episodes,
+                "paper": paper and paper.mean,
+                "paper_std": paper and paper.std,
+                "paper_num_seeds": paper and paper.num_seeds,
+            }
+        )
+    return tables.csv_text(rows)
 
 
 def as_markdown(study: Study) -> str:
     """A row per value, a column per setting and behind it the paper's, where it has points."""
-    lines = [f"# {study.title}: {study.metric.name.lower()}", ""]
     columns = {setting: study.of(setting) for setting in study.settings}
     published = [s for s, points in columns.items() if any(p.paper for p in points)]
-    headings = [study.axis]
+    header = [study.axis]
     for setting in columns:
         beside = "paper" if len(published) == 1 else f"paper, {setting}"
-        headings += [setting, *([beside] if setting in published else [])]
-    lines.append("| " + " | ".join(headings) + " |")
-    lines.append("|" + " --- |" * len(headings))
-    text = study.metric.text
+        header += [setting, *([beside] if setting in published else [])]
+    text, rows = study.metric.text, []
     for x in dict.fromkeys(point.x for point in study.points):
         cells = [f"{x:g}"]
         for setting, points in columns.items():
@@ -119,13 +120,13 @@ def as_markdown(study: Study) -> str:
             if setting in published:
                 paper = point.paper
                 cells.append(f"{text(paper.mean)} ± {text(paper.std)}" if paper else "-")
-        lines.append("| " + " | ".join(cells) + " |")
-    seeds = sorted({len(point.means) for point in study.points})
-    episodes = sorted({point.num_episodes for point in study.points})
-    of_each = f", {episodes[0]:,} episodes each" if episodes[0] else ""
-    lines += ["", f"{study.note} Seeds: {', '.join(map(str, seeds))}{of_each}; ± is the population"]
-    lines[-1] += " standard deviation over seeds."
-    return "\n".join(lines) + "\n"
+        rows.append(cells)
+    seeds = ", ".join(map(str, sorted({len(point.means) for point in study.points})))
+    fewest = min(point.num_episodes for point in study.points)
+    of_each = f", {fewest:,} episodes each" if fewest else ""
+    lines = [f"# {study.title}: {study.metric.name.lower()}", "", *tables.table(header, rows), ""]
+    note = f"{study.note} Seeds: {seeds}{of_each}; ± is the population standard deviation over "
+    return "\n".join([*lines, f"{note}seeds."]) + "\n"
 
 
 def study_figure(study: Study) -> Figure:

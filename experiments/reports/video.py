@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterable
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-
-from envs_mjx.grid_world.drawing import animate_episode
+from PIL import Image
 
 SUFFIXES = (".gif", ".mp4")
+_LAST_MS = 1500
 _BLOCK = 2  # Pixels: what the usual pixel format of MP4 needs sides to be multiples of.
 
 
-def write_video(frames: Iterable[np.ndarray], path: str | Path, frame_ms: int = 60) -> Path:
-    """Writes frames as an endless GIF or as MP4; the last frame stays a while.
+def write_video(frames: Sequence[np.ndarray], path: Path, frame_ms: int = 60) -> Path:
+    """Writes frames as an endless GIF, whose last frame stays a while, or as MP4.
 
     Args:
       frames: uint8[height, width, 3] each, all of one size, at least one.
@@ -29,7 +29,6 @@ def write_video(frames: Iterable[np.ndarray], path: str | Path, frame_ms: int = 
       ValueError: no frame, another suffix, or frames that do not fit together.
       ImportError: MP4 without imageio and its ffmpeg.
     """
-    path, frames = Path(path), list(frames)
     if path.suffix not in SUFFIXES:
         raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}.")
     if len({frame.shape for frame in frames}) != 1:
@@ -38,14 +37,28 @@ def write_video(frames: Iterable[np.ndarray], path: str | Path, frame_ms: int = 
             f"{sorted({frame.shape for frame in frames})}."
         )
     path.parent.mkdir(parents=True, exist_ok=True)
-    if path.suffix == ".gif":
-        animate_episode(frames, path, frame_ms)
-    else:
-        _write_mp4(frames, path, frame_ms)
+    (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, path, frame_ms)
     return path
 
 
-def _write_mp4(frames: list[np.ndarray], path: Path, frame_ms: int) -> None:
+def _write_gif(frames: Sequence[np.ndarray], path: Path, frame_ms: int) -> None:
+    # One palette for all frames, so that colours do not flicker.
+    palette = Image.fromarray(np.concatenate([frames[0], frames[-1]])).quantize(128)
+    images = [
+        Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.NONE)
+        for frame in frames
+    ]
+    images[0].save(
+        path,
+        format="GIF",
+        save_all=True,
+        append_images=images[1:],
+        duration=[frame_ms] * (len(images) - 1) + [_LAST_MS],
+        loop=0,
+    )
+
+
+def _write_mp4(frames: Sequence[np.ndarray], path: Path, frame_ms: int) -> None:
     try:
         imageio = importlib.import_module("imageio.v2")
         importlib.import_module("imageio_ffmpeg")  # Found by imageio itself.

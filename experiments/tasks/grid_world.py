@@ -25,8 +25,8 @@ def _record_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray
 
 def _draw(env: Any, episode: Episode, *, size: int) -> Film:
     del env
-    frames = drawing.draw_episode(episode.states, episode.action_ids, episode.rewards, size)
-    return Film(frames, episode.metrics)
+    shown = episode.states, episode.action_ids, episode.rewards, size
+    return Film([*drawing.draw_episode(*shown), drawing.draw_way(*shown)], episode.metrics)
 
 
 def _targets(universe: ActionUniverse) -> Mapping[str, np.ndarray]:
@@ -152,6 +152,6 @@ TASK = Task(
             evaluation=7_000,
         ),
         representation_targets=_targets,
-        filming=Filming(_draw),
+        filming=Filming(_draw, frame_ms=220),
     ),
 )

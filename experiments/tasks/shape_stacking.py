@@ -13,10 +13,10 @@ from typing import Any
 from envs_mjx.shape_stacking import (
     ShapeStacking,
     StackingSettings,
+    films,
     published_split,
     shape_universe,
 )
-from envs_mjx.shape_stacking.films import draw_episode, episode_page
 from envs_mjx.shape_stacking.play import PICTURE_SHAPE, draw_pictures, record_block
 from jaxnew.observations import RecordingFormat
 from jaxnew.ppo import Hyperparameters, PPOConfig
@@ -152,12 +152,9 @@ _PLAY = Play(
 
 
 def _draw(env: Any, episode: Episode, *, size: int) -> Film:
-    frames = draw_episode(env, episode.states, episode.actions, episode.rewards, size=size)
-    return Film(frames, episode.metrics)
-
-
-def _page(env: Any, episode: Episode) -> str:
-    return episode_page(env, episode.states, episode.actions)
+    shown = films.seen(env, episode.states, episode.actions)
+    page = partial(films.page, shown)
+    return Film(films.draw(env, shown, size), episode.metrics, page)
 
 
 # No height is a success by itself. 1.3 m is what random play reaches on average that never stops
@@ -166,7 +163,7 @@ _FILMING = Filming(
     _draw,
     success_from=1.3,
     criterion="at least 1.3 m, the mean of random play that never stops",
-    make_page=_page,
+    has_pages=True,
 )
 
 

@@ -52,10 +52,12 @@ class Film(NamedTuple):
     Attributes:
       frames: uint8[height, width, 3] each, all of one size; the last one shows the end.
       metrics: of the episode, at the end; where it was played again they must be the same.
+      make_page: makes the same as an interactive page, HTML; None where there is none.
     """
 
     frames: list[np.ndarray]
     metrics: Mapping[str, float]
+    make_page: Callable[[], str] | None = None
 
 
 class DrawEpisode(Protocol):
@@ -70,12 +72,6 @@ class DrawEpisode(Protocol):
     def __call__(self, environment: Any, episode: Episode, /, *, size: int) -> Film: ...
 
 
-class MakePage(Protocol):
-    """An episode as an interactive page; returns HTML."""
-
-    def __call__(self, environment: Any, episode: Episode, /) -> str: ...
-
-
 @dataclass(frozen=True)
 class Filming:
     """How episodes are shown.
@@ -85,13 +81,19 @@ class Filming:
       success_from: an episode whose `Task.selection_metric` is at least this is a success.
       criterion: the same in words, where the metric is not success itself. The sheet of an
         evaluation's last pictures then shows the best and the worst of them.
-      make_page: see `MakePage`; None where there is none.
+      frame_ms: milliseconds that a frame is shown.
+      has_pages: films come with a page, see `Film`.
     """
 
     draw: DrawEpisode
     success_from: float = 1.0
     criterion: str = ""
-    make_page: MakePage | None = None
+    frame_ms: int = 60
+    has_pages: bool = False
+
+    def is_success(self, value: float) -> bool:
+        """Whether an episode with this value of `Task.selection_metric` is shown as a success."""
+        return value >= self.success_from
 
 
 @dataclass(frozen=True)

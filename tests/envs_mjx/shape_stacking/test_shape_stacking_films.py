@@ -133,7 +133,7 @@ def test_a_film_falls_rests_and_ends_with_the_state(
     states = [state_of(start), state_of(first, 1), state_of(last, 2)]
     monkeypatch.setattr(films, "draw_bodies", lambda bodies, camera, size: bodies)
     actions = [action(CUBE, -0.65), action(3, 0.0, stop=True)]
-    shown = films.draw_episode(env, states, actions, [0.0, 1.0])
+    shown = films.draw(env, films.seen(env, states, actions))
     np.testing.assert_array_equal(shown[0].qpos, start.qpos)
     let_go = shown[1].qpos[SLOT]
     np.testing.assert_allclose(let_go[[0, 2]], (-0.65, 0.819), atol=5e-4)
@@ -148,7 +148,7 @@ def test_a_film_falls_rests_and_ends_with_the_state(
     # edge, and the stop lets 0.6 s go by.
     np.testing.assert_array_equal(shown[-1].qpos, last.qpos)
     with pytest.raises(ValueError, match="3 states and 1 actions; T actions need"):
-        films.draw_episode(env, states, actions[:1], [0.0])
+        films.seen(env, states, actions[:1])
 
 
 @pytest.mark.unit
@@ -159,16 +159,16 @@ def test_a_page_holds_what_a_film_shows(engine: MujocoC, monkeypatch: pytest.Mon
     states, actions = [state_of(start), state_of(first, 1)], [action(CUBE, -0.65)]
     given: list[tuple[np.ndarray, np.ndarray, float]] = []
     monkeypatch.setattr(viewer, "tower_html", lambda *page: given.append(page) or "page")
-    assert films.episode_page(env, states, actions) == "page"
+    shown = films.seen(env, states, actions)
+    assert films.page(shown) == "page"
     ((ids, qpos, seconds),) = given
     np.testing.assert_array_equal(ids, first.shape_ids)
-    shown = films.seen(env, states, actions)
     np.testing.assert_array_equal(qpos, np.stack([bodies.qpos for bodies in shown]))
     assert len(qpos) > 5
     assert seconds == pytest.approx(0.06)
     np.testing.assert_array_equal(qpos[0, SLOT], scene.parked_qpos()[SLOT])
     with pytest.raises(ValueError, match="2 states and 0 actions"):
-        films.episode_page(env, states, [])
+        films.seen(env, states, [])
 
 
 @pytest.mark.golden

@@ -1,4 +1,4 @@
-"""The paper's numbers are those of the released results (experiments spec 3-6 and 15)."""
+"""The paper's numbers are those of the released results."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_bars_of_the_paper(
 
 @pytest.mark.golden
 def test_the_first_figure_counts_unless_one_is_named() -> None:
-    # Experiments spec 3 and 5: Push, default split 79.7 and class-disjoint split 17.2.
+    # Push, default split 79.7 and class-disjoint split 17.2.
     main = paper_value("CREATE Push", "ours", "test")
     full = paper_value("CREATE Push", "ours", "test", figure="fig7a_create_full_split")
     assert main is not None
@@ -85,7 +85,7 @@ def test_learning_curve_in_true_steps_without_padding() -> None:
     ],
 )
 def test_ends_of_learning_curves(environment: str, split: str, end: float) -> None:
-    # Experiments spec 15, end values; the last point before the budget may be one bin earlier.
+    # The last point before the budget may be one bin earlier.
     curve = paper_curve(environment, "ours", split)
     assert curve is not None
     assert curve.mean[-1] == pytest.approx(end, rel=0.005)
@@ -131,7 +131,6 @@ def test_names_of_our_settings_in_the_paper() -> None:
 
 @pytest.mark.unit
 def test_training_budgets() -> None:
-    # Experiments spec 2; section 12 for the fully observable variant.
     assert paper_steps("Grid World") == 40e6
     assert paper_steps("CREATE Belt") == 60e6
     assert paper_steps("Shape Stacking") == 3e6
