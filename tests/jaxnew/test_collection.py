@@ -258,7 +258,7 @@ def test_another_format_version_is_refused(tmp_path: Path, monkeypatch: pytest.M
     gather(tmp_path)
     monkeypatch.setattr("jaxnew.collection.FORMAT_VERSION", 9)
     for read in (lambda: load(tmp_path, make_universe()), lambda: gather(tmp_path)):
-        with pytest.raises(ObservationsError, match="of format 1; this program reads .* format 9"):
+        with pytest.raises(ObservationsError, match=r"of format 1; this program reads .* format 9"):
             read()
 
 

@@ -195,6 +195,19 @@ def test_ranges_and_names(changes: dict[str, Any], says: str) -> None:
 
 
 @pytest.mark.unit
+def test_the_last_value_counts() -> None:
+    texts = ["environment.reward_scale=2", "num_updates=9", "environment.reward_scale=3"]
+    once = with_set(LADDER, texts)
+    assert (once.environment.reward_scale, once.num_updates) == (3.0, 9)
+    again = with_set(once, {"environment.reward_scale": 4.0})
+    assert again == with_set(LADDER, ["num_updates=9", "environment.reward_scale=4"])
+    with pytest.raises(ConfigError, match=r"must look like path.to.field=value"):
+        with_set(LADDER, ["environment.reward_scale"])
+    with pytest.raises(ConfigError, match=r"environment\.x cannot be set: environment is None"):
+        with_set(config_of(toy_task.TASK), ["environment.x=2"])
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize("seed", [2**32, -1, True, 1.5, "1", None, np.int64(3)])
 def test_seeds_are_taken_whole_or_refused(seed: Any) -> None:
     for make in (
@@ -258,6 +271,10 @@ def test_settings_reach_environments_inside_jit(name: str) -> None:
         default = getattr(task.environment, field)
         assert with_set(changed, {f"environment.{field}": default}) == config
     assert described(with_settings(task, config).environment_of()) == published
+    if name.startswith("shape_stacking"):
+        on_the_host = with_set(config, ["environment.physics=mujoco"])
+        env: Any = with_settings(task, on_the_host).environment_of()
+        assert (env.engine.name, env.position_dim) == ("mujoco_c", 2)
 
 
 @pytest.mark.unit
