@@ -24,7 +24,7 @@ from jaxnew.task.places import UsageError
 from jaxnew.training import _warm_start, finetune, train
 from tests import toy_device, toy_task
 
-pytestmark = pytest.mark.unit
+pytestmark = pytest.mark.integration
 
 LADDER = toy_device.TASK
 TABLE = engineered_table(Domain.of(LADDER).universe, "gt3")
