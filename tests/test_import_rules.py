@@ -192,7 +192,7 @@ def why_not_within_jaxnew(module: str, name: str) -> str | None:
 
 
 @pytest.mark.unit
-def test_imports_keep_to_the_design() -> None:
+def test_imports_keep_to_the_rules() -> None:
     assert len(MODULES) > 40
     assert violations(IMPORTS) == []
 
@@ -307,7 +307,7 @@ def test_each_rule_is_broken_by_an_example(
         ("experiments/reports/x.py", "from experiments.main import child\nimport experiments"),
     ],
 )
-def test_what_the_design_allows_is_allowed(tmp_path: Path, path: str, line: str) -> None:
+def test_what_the_rules_allow_is_allowed(tmp_path: Path, path: str, line: str) -> None:
     file = tmp_path / path
     file.parent.mkdir(parents=True)
     file.write_text(line)
