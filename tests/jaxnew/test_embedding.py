@@ -153,14 +153,12 @@ def test_settings_make_another_run(encoder: Encoder, runs: Path, tmp_path: Path)
     for changes in ({"model.action_latent": 3}, ["model.action_latent=3"]):
         with pytest.raises(ConfigMismatch, match=r"model\.action_latent: 4 recorded, 3 asked"):
             embed(LADDER, "hvae", budget="smoke", runs=runs, set=changes)
-    other = embed(
-        LADDER, "hvae-oracle", budget="smoke", workdir=tmp_path, runs=runs, set=changes, seed=7
-    )
+    others = {"workdir": tmp_path, "set": changes, "seed": 7, "num_recordings": 2}
+    other = embed(LADDER, "hvae-oracle", budget="smoke", runs=runs, **others)
     assert (other.path, other.table.vectors.shape[1], other.config.seed) == (tmp_path, 3, 7)
     assert other.config.train_on == "all"
-    more = {"num_recordings": 2, "overwrite": True}
-    third = embed(LADDER, "vae", budget="smoke", workdir=tmp_path, runs=runs, **more)
-    assert third.config.observations_hash != other.config.observations_hash
+    assert other.config.observations_hash == collect(DOMAIN, runs, 2).recorded.hash
+    assert other.config.observations_hash != encoder.config.observations_hash
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import shutil
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -86,13 +87,14 @@ def test_settings_make_another_run(trained: Run, runs: Path, tmp_path: Path) -> 
 
 
 def test_a_run_that_was_stopped_goes_on(trained: Run, tmp_path: Path) -> None:
-    """Two updates, the rest in another call: the same parameters, bit for bit."""
-    train(LADDER, TABLE, budget="smoke", workdir=tmp_path)
-    checkpointer = Checkpointer(tmp_path / "checkpoints")
+    """From where it stood after two updates: the same parameters, bit for bit."""
+    path = tmp_path / "stopped"
+    shutil.copytree(trained.path, path)
+    checkpointer = Checkpointer(path / "checkpoints")
     assert checkpointer.steps("latest") == [2, 4]
     checkpointer.discard_after(2)
-    resumed = train(LADDER, TABLE, budget="smoke", workdir=tmp_path)
-    assert resumed.path == tmp_path
+    resumed = train(LADDER, TABLE, budget="smoke", workdir=path)
+    assert resumed.path == path
     latest, expected = (Run.load(run.path, "latest") for run in (resumed, trained))
     assert latest.step == expected.step == 4
     for one, other in zip(*map(jax.tree.leaves, (latest.policy, expected.policy)), strict=True):
