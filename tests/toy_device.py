@@ -51,7 +51,7 @@ class Ladder(probe.TableWorld):
         super().__init__(A)
         ladder = probe.ladder(A, time_limit=time_limit)
         scale = -reward_scale if is_inverted else reward_scale
-        self._ladder = ladder.replace(reward=scale * ladder.reward)
+        self._ladder = replace(ladder, reward=scale * ladder.reward)
 
     @property
     def default_params(self) -> probe.TableParams:

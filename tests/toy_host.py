@@ -66,8 +66,10 @@ class ToyPool:
     """
 
     make_env: Callable[[], Any] = ToyEnv
-    observation_shape, observation_dtype = (SIZE, SIZE), np.dtype(np.uint8)
-    position_dim, episode_metrics, max_steps = 2, METRICS, MAX_STEPS
+    observation_shape: tuple[int, ...] = (SIZE, SIZE)
+    observation_dtype: np.dtype[Any] = np.dtype(np.uint8)
+    episode_metrics: tuple[str, ...] = METRICS
+    position_dim, max_steps = 2, MAX_STEPS
 
     def __init__(
         self, num_envs: int, num_halves: int = 2, seed: int = 0, num_workers: int = 1

@@ -102,7 +102,7 @@ def test_drawn_recordings_are_the_same_stored_or_on_demand(
         found.for_training(ids).gather(rows.T, recordings)  # type: ignore[union-attr]
         for found in (on_demand, stored)
     ]
-    np.testing.assert_array_equal(*batches)
+    np.testing.assert_array_equal(batches[0], batches[1])
     assert batches[0].dtype == np.uint8
     assert batches[0].any()
 
@@ -153,7 +153,7 @@ def test_settings_make_another_run(encoder: Encoder, runs: Path, tmp_path: Path)
     for changes in ({"model.action_latent": 3}, ["model.action_latent=3"]):
         with pytest.raises(ConfigMismatch, match=r"model\.action_latent: 4 recorded, 3 asked"):
             embed(LADDER, "hvae", budget="smoke", runs=runs, set=changes)
-    others = {"workdir": tmp_path, "set": changes, "seed": 7, "num_recordings": 2}
+    others: dict[str, Any] = {"workdir": tmp_path, "set": changes, "seed": 7, "num_recordings": 2}
     other = embed(LADDER, "hvae-oracle", budget="smoke", runs=runs, **others)
     assert (other.path, other.table.vectors.shape[1], other.config.seed) == (tmp_path, 3, 7)
     assert other.config.train_on == "all"

@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -155,7 +156,7 @@ def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
     assert list(named.rows) == ["table-new"]
     whole = np.array(run.trainer.training.table)
     whole[ids] = vectors
-    actions = run.trainer.actions("new", ids, vectors=whole)
+    actions = run.trainer.actions("new", ids, vectors=jnp.asarray(whole))
     assert named.rows["table-new"]["metrics"] == summarize(
         measure(run.trainer.rollout, run.policy, actions, 6, is_greedy=True)
     )

@@ -48,7 +48,7 @@ def swept(tmp_path_factory: pytest.TempPathFactory) -> Runs:
 
 @pytest.mark.unit
 def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
-    vary = {"entropy_coefficient": (0.0, 0.1), "clip": np.array([0.1, 0.2, 0.3])}
+    vary: Any = {"entropy_coefficient": (0.0, 0.1), "clip": np.array([0.1, 0.2, 0.3])}
     members = member_configs(base, [1, 2], vary)
     found = {
         (m.seed, m.hyperparameters.entropy_coefficient, m.hyperparameters.clip) for m in members
@@ -196,5 +196,6 @@ def test_a_sweep_says_what_it_takes(base: TrainConfig) -> None:
     configs = member_configs(base, [1, 2], {"clip": [0.1, 0.3]})
     trainer = Trainer.of(configs[0], LADDER, DOMAIN.split, TABLE)
     program = SweepProgram.of(trainer, configs, jax.devices()[:1])
-    assert program.hyperparameters.clip.tolist() == pytest.approx([0.1, 0.1, 0.3, 0.3])
-    assert program.hyperparameters.discount.shape == (4,)
+    numbers: Any = program.hyperparameters
+    assert numbers.clip.tolist() == pytest.approx([0.1, 0.1, 0.3, 0.3])
+    assert numbers.discount.shape == (4,)

@@ -205,7 +205,12 @@ def test_sets_of_training_and_of_evaluations() -> None:
         assert set(sets_of(actions).ravel().tolist()) == set(split.ids(part).tolist())
     other = trainer.actions("test", vectors=trainer.training.table + 1)
     np.testing.assert_array_equal(other.table, table + 1)
-    for wrong in ({"set_size": 7}, {"ids": np.array([], np.int32)}, {"ids": np.array([3, 3])}):
+    wrongs: tuple[dict[str, Any], ...] = (
+        {"set_size": 7},
+        {"ids": np.array([], np.int32)},
+        {"ids": np.array([3, 3])},
+    )
+    for wrong in wrongs:
         with pytest.raises(ValueError, match=r"Sets of 7 .* the mine actions|distinct ids"):
             trainer.actions("mine", **{"ids": split.test, **wrong})
     with pytest.raises(ValueError, match=r"Sets of 30 .* the train actions"):

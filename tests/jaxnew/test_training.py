@@ -12,9 +12,10 @@ import jax
 import numpy as np
 import pytest
 
+from jaxnew.actions import SplitMismatch
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.ppo import TrainState
-from jaxnew.representation.table import SplitMismatch, engineered_table
+from jaxnew.representation.table import engineered_table
 from jaxnew.run import Run
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import ConfigError

@@ -333,6 +333,16 @@ def test_updates_are_the_same_however_they_are_run() -> None:
         np.testing.assert_allclose(a[0], b, rtol=1e-5, atol=1e-5)
 
 
+@pytest.mark.property
+def test_every_update_draws_numbers_of_its_own() -> None:
+    """What happened in the rollout, which knows neither learning rate nor gradient."""
+    update = jax.jit(learner_of(CONFIG).update)
+    state = initial_state(0)
+    states = [state, replace(state, step=jnp.int32(1)), replace(state, key=jax.random.key(9))]
+    returns = [float(update(s, HP, ACTIONS)[1]["episodes/episode_return"]) for s in states]
+    assert len(set(returns)) == 3
+
+
 @pytest.mark.unit
 def test_compiled_parts_are_compiled_once() -> None:
     learner = learner_of(CONFIG)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
 from jaxnew.task.places import UsageError, budget_of, load_place
@@ -32,7 +34,7 @@ def test_what_is_not_there_is_said(place: str, says: str) -> None:
 
 
 def test_a_module_that_lacks_another_is_not_called_absent(
-    tmp_path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "needs_more.py").write_text("import not_installed_anywhere\nTASK = 1\n")
     monkeypatch.syspath_prepend(str(tmp_path))

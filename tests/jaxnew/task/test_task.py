@@ -29,7 +29,7 @@ def test_the_environment_is_made_from_the_settings() -> None:
     )
     assert LADDER.action_spec == ActionSpec(toy_device.A)
     nothing = replace(
-        LADDER, environment=None, make_environment=partial(toy_device.Ladder, 1, 1, 0)
+        LADDER, environment=None, make_environment=partial(toy_device.Ladder, 1, 1, False)
     )
     assert nothing.environment_of().default_params.time_limit == 1
     assert TOY.action_spec == ActionSpec(toy_task.A, position_dim=2)
