@@ -20,8 +20,11 @@ from jaxnew.observations import RecordingFormat, action_rng
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
-from jaxnew.rollout.device import RolloutConfig
-from jaxnew.task import LoopConfig, Play, StageOneBudget, StageTwoBudget, Task
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.sampling import SetConfig
+from jaxnew.task.budgets import StageOneBudget, StageTwoBudget
+from jaxnew.task.presentation import Presentation
+from jaxnew.task.task import Play, Task
 
 NUM_KICKS = 300
 NUM_FRAMES = 8  # Positions of the puck after the start that a recording shows.
@@ -206,51 +209,58 @@ PLAY = Play(
 )
 
 
-def _stage_one(num_recordings: int, hvae: RepresentationConfig, cost: str) -> StageOneBudget:
-    return StageOneBudget(
-        num_recordings=num_recordings,
-        configs={"hvae": hvae, "vae": replace(hvae, kind="vae", actions_per_batch=150)},
-        chunk_steps=min(20, hvae.num_steps),
-        checkpoint_every=max(20, hvae.num_steps // 4),
-        cost=cost,
-    )
-
-
-_HVAE = RepresentationConfig(action_latent=8, actions_per_batch=32, recordings_per_action=16)
-_PPO = PPOConfig(
-    rollout=RolloutConfig(num_envs=32, num_steps=128, set_size=20), lr_steps=200 * 32 * 128
+_HVAE = RepresentationConfig(
+    action_latent=8, actions_per_batch=32, recordings_per_action=16, num_steps=800
 )
-_HYPERPARAMETERS = Hyperparameters(entropy_coefficient=0.01)
+_STAGE_ONE = StageOneBudget(
+    num_recordings=64,
+    hvae=_HVAE,
+    vae=replace(_HVAE, kind="vae", actions_per_batch=150),
+    checkpoint_every=200,
+    cost="about a minute on one core",
+)
+_STAGE_TWO = StageTwoBudget(
+    num_updates=200,
+    ppo=PPOConfig(rollout=RolloutConfig(num_envs=32, num_steps=128), lr_steps=200 * 32 * 128),
+    sets=SetConfig(20),
+    hyperparameters=Hyperparameters(entropy_coefficient=0.01),
+    final_episodes=5000,
+    cost="half a minute on one core",
+)
 
 TASK = Task(
     name="kicks",
     make_environment=Kicks,
     make_universe=kick_universe,
     splits={"default": random_halves_split, "right-is-new": right_is_new},
-    play=PLAY,
+    plays=(PLAY,),
     stage_one={
-        "smoke": _stage_one(8, replace(_HVAE, num_steps=8, recordings_per_action=4), "seconds"),
-        "laptop": _stage_one(64, replace(_HVAE, num_steps=800), "about a minute on one core"),
+        "smoke": _STAGE_ONE.vary(
+            num_recordings=8,
+            hvae__num_steps=8,
+            hvae__recordings_per_action=4,
+            vae__num_steps=8,
+            vae__recordings_per_action=4,
+            checkpoint_every=20,
+            cost="seconds",
+        ),
+        "laptop": _STAGE_ONE,
     },
     stage_two={
-        "smoke": StageTwoBudget(
+        "smoke": _STAGE_TWO.vary(
             num_updates=4,
-            ppo=replace(
-                _PPO, rollout=replace(_PPO.rollout, num_envs=8, num_steps=32), microbatch_size=0
-            ),
-            hyperparameters=_HYPERPARAMETERS,
-            loop=LoopConfig(chunk_updates=2, evaluate_every=2, evaluation_episodes=64),
+            ppo__rollout__num_envs=8,
+            ppo__rollout__num_steps=32,
+            ppo__microbatch_size=0,
+            loop__chunk_updates=2,
+            loop__evaluate_every=2,
+            loop__evaluation_episodes=64,
             final_episodes=128,
             cost="seconds",
         ),
-        "laptop": StageTwoBudget(
-            num_updates=200,
-            ppo=_PPO,
-            hyperparameters=_HYPERPARAMETERS,
-            loop=LoopConfig(),
-            final_episodes=5000,
-            cost="half a minute on one core",
-        ),
+        "laptop": _STAGE_TWO,
     },
-    representation_targets=lambda universe: {"where it stops": universe.content[:, -1]},
+    shown=Presentation(
+        representation_targets=lambda universe: {"where it stops": universe.content[:, -1]}
+    ),
 )

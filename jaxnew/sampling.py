@@ -201,6 +201,10 @@ class Actions:
             ids, capacity=len(table), always_available=always_available, groups=groups
         )
         check_set_size(pool, set_size, name)
+        if padded_size and padded_size < set_size:
+            raise ValueError(
+                f"padded_size={padded_size} is below set_size={set_size}; use 0 for no padding."
+            )
         return cls(table, pool, set_size, padded_size or set_size)
 
     def growing(self, first_size: int, growth: int = 1) -> Actions:

@@ -1,15 +1,19 @@
-"""Who may import whom (DESIGN section 2), read from the source, also inside functions."""
+"""Who may import whom, read from the source, also inside functions; and the face of `jaxnew`."""
 
 from __future__ import annotations
 
 import ast
 import importlib
+import importlib.metadata
 import subprocess
 import sys
+import tomllib
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+
+import jaxnew
 
 ROOT = Path(__file__).resolve().parents[1]
 PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
@@ -17,20 +21,25 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # Layers of `jaxnew`, lowest first. A module may import lower layers; within one layer, only along
 # `SIDEWAYS`. Files, metrics, configs and the like know nothing of what is learned.
 LAYERS = (
-    {
-        *("actions", "observations"),
-        *("checkpoint", "config", "cores", "metrics", "run_directory"),
-    },
+    {"actions", "cores", "storage", "observations", "collection"},
     {"sampling", "environment", "convolution"},
     {"policy", "representation"},
     {"rollout", "ppo"},
-    {"loop", "evaluation", "host_evaluation"},
+    {"loop", "evaluation"},
     {"task"},
+    {"embedding", "trainer", "run", "training", "sweeping"},
 )
-SIDEWAYS = {("ppo", "rollout"), ("host_evaluation", "evaluation")}
+SIDEWAYS = {
+    "observations": {"actions", "storage"},
+    "collection": {"actions", "observations", "storage"},
+    "ppo": {"rollout"},
+    "run": {"embedding", "trainer"},
+    "training": {"embedding", "run", "trainer"},
+    "sweeping": {"run", "trainer", "training"},
+}
 
 # Of `experiments`, lowest first; commands and benchmarks are above them.
-EXPERIMENTS = ("tasks", "pipeline", "reports", "untrained")
+EXPERIMENTS = ("tasks", "main", "reports", "untrained", "flags")
 
 HEAVY = {
     "brax": {"envs_mjx.brax_adapter"},
@@ -109,16 +118,13 @@ def is_ours(name: str) -> bool:
 
 
 def layer_of(module: str) -> int:
-    """Index into `LAYERS`; private modules (`jaxnew.storage.files`) are support."""
+    """Index into `LAYERS`."""
     part = module.split(".")[1]
-    if part.startswith("_"):
-        return 0
     for layer, parts in enumerate(LAYERS):
         if part in parts:
             return layer
     raise AssertionError(
-        f"{module} has no layer; add `{part}` to LAYERS in {Path(__file__).name} where DESIGN "
-        "section 2 wants it."
+        f"{module} has no layer; add `{part}` to LAYERS in {Path(__file__).name} where it belongs."
     )
 
 
@@ -138,6 +144,8 @@ def why_not(module: str, package: str, name: str) -> str | None:
     for library, users in HEAVY.items():
         if is_within(name, {library}) and package != "experiments" and not is_within(module, users):
             return f"only {sorted(users)} may import {library}, which takes seconds"
+    if is_within(name, {"absl"}) and package != "experiments":
+        return "flags are of commands"
     if package == "jaxnew":
         others = {"envs_mjx", "envs_host", "experiments", "examples", "gymnasium", "pymunk"}
         if is_within(name, others):
@@ -179,17 +187,12 @@ def why_not_within_jaxnew(module: str, name: str) -> str | None:
         return "import the module and not the package's face"
     here, there = module.split(".")[1], name.split(".")[1]
     is_down = layer_of(name) < layer_of(module)
-    is_beside = here == there or (here, there) in SIDEWAYS
-    is_support = layer_of(name) == layer_of(module) == 0
-    if not (is_down or is_beside or is_support):
-        return f"{here} may not import {there}"
-    if here == "actions":
-        return "actions stands alone"
-    return None
+    is_beside = here == there or there in SIDEWAYS.get(here, ())
+    return None if is_down or is_beside else f"{here} may not import {there}"
 
 
 @pytest.mark.unit
-def test_imports_keep_to_the_design() -> None:
+def test_imports_keep_to_the_rules() -> None:
     assert len(MODULES) > 40
     assert violations(IMPORTS) == []
 
@@ -232,9 +235,25 @@ def test_actions_needs_numpy_only() -> None:
         ("jaxnew/policy/x.py", "from jaxnew import representation", "policy may not import repr"),
         ("jaxnew/rollout/x.py", "import jaxnew.ppo.learner", "rollout may not import ppo"),
         ("jaxnew/rollout/x.py", "from jaxnew import loop", "rollout may not import loop"),
-        ("jaxnew/metrics.py", "from jaxnew.evaluation import Evaluator", "metrics may not"),
+        ("jaxnew/storage/x.py", "from jaxnew.evaluation import measure", "storage may not"),
+        ("jaxnew/storage/x.py", "from jaxnew.observations import Recordings", "storage may not"),
+        ("jaxnew/observations.py", "from jaxnew import collection", "observations may not import"),
+        ("jaxnew/cores.py", "from jaxnew.storage import files", "cores may not import storage"),
         ("jaxnew/environment.py", "from jaxnew.sampling import ActionPool", "environment may not"),
-        ("jaxnew/actions.py", "from jaxnew import config", "actions stands alone"),
+        ("jaxnew/actions.py", "from jaxnew.storage import config", "actions may not import stor"),
+        ("jaxnew/evaluation.py", "from jaxnew import loop", "evaluation may not import loop"),
+        (
+            "jaxnew/evaluation.py",
+            "from jaxnew.task.task import Task",
+            "evaluation may not import t",
+        ),
+        ("jaxnew/task/x.py", "from jaxnew.trainer import Trainer", "task may not import trainer"),
+        ("jaxnew/trainer.py", "from jaxnew.embedding import embed", "trainer may not import emb"),
+        ("jaxnew/embedding.py", "def f():\n    from jaxnew.run import Run", "embedding may not"),
+        ("jaxnew/run.py", "from jaxnew.training import train", "run may not import training"),
+        ("jaxnew/training.py", "from jaxnew import sweeping", "training may not import sweeping"),
+        ("jaxnew/training.py", "from absl import flags", "flags are of commands"),
+        ("examples/x.py", "import absl.flags", "flags are of commands"),
         ("jaxnew/__init__.py", "from jaxnew.actions import ActionSplit", "lazily"),
         ("jaxnew/policy/x.py", "from jaxnew import ActionSplit", "face"),
         ("jaxnew/ppo/x.py", "import mujoco.mjx", "takes seconds"),
@@ -246,13 +265,16 @@ def test_actions_needs_numpy_only() -> None:
         ("envs_host/x.py", "from jaxnew import ActionSplit", "host workers"),
         ("envs_host/x.py", "from jaxnew.environment import Action", "host workers"),
         ("envs_host/x.py", 'import importlib\nimportlib.import_module("jax")', "host workers"),
-        ("examples/x.py", "from experiments.pipeline.flags import load_task", "needs jaxnew only"),
+        ("examples/x.py", "from experiments.tasks.create import TASK", "needs jaxnew only"),
         ("examples/x.py", "from envs_mjx.grid_world import GridWorld", "needs jaxnew only"),
         ("experiments/x.py", "from examples.kicks import TASK", "by its place"),
-        ("experiments/pipeline/x.py", "from experiments.reports import plots", "is layered"),
+        ("experiments/main.py", "from experiments.reports import plots", "is layered"),
         ("experiments/reports/x.py", "from experiments import train", "knows no command"),
-        ("experiments/tasks/x.py", "import experiments.pipeline.flags", "is layered"),
-        ("jaxnew/task.py", "import examples", "no simulator"),
+        ("experiments/reports/x.py", "from experiments.flags import Arguments", "is layered"),
+        ("experiments/flags.py", "from experiments import evaluate", "knows no command"),
+        ("experiments/tasks/x.py", "import experiments.flags", "is layered"),
+        ("experiments/tasks/x.py", "from experiments import main", "is layered"),
+        ("jaxnew/task/x.py", "import examples", "no simulator"),
         ("envs_host/create/x.py", "from ...jaxnew.environment import A", "host workers"),
     ],
 )
@@ -275,14 +297,17 @@ def test_each_rule_is_broken_by_an_example(
         ("envs_host/x.py", "import os\nimport numpy as np\nimport pymunk\nfrom . import create"),
         ("envs_host/x.py", "from jaxnew.actions import ActionSplit\nfrom jaxnew import actions"),
         ("envs_mjx/shape_stacking/engines/x.py", "import mujoco\nfrom jaxnew import observations"),
-        ("jaxnew/ppo/x.py", "from jaxnew.rollout import batch\nfrom .learner import Learner"),
-        ("jaxnew/evaluation.py", "import jaxnew.ppo\nfrom jaxnew import _files, metrics"),
-        ("experiments/x.py", "import brax, envs_host, envs_mjx.grid_world, jaxnew.loop"),
+        ("jaxnew/ppo/x.py", "from jaxnew.rollout import contract\nfrom .learner import Learner"),
+        ("jaxnew/evaluation.py", "import jaxnew.ppo\nfrom jaxnew.storage import files, metrics"),
+        ("jaxnew/run.py", "from jaxnew.embedding import TABLE_FILE\nimport jaxnew.trainer"),
+        ("jaxnew/sweeping.py", "from jaxnew import run, training\nfrom jaxnew.task import domain"),
+        ("experiments/x.py", "import brax, envs_host, envs_mjx.grid_world, jaxnew.loop, absl"),
         ("experiments/x.py", "from experiments import figures\nimport experiments.reports.plots"),
-        ("experiments/reports/x.py", "from experiments.pipeline import flags\nimport experiments"),
+        ("experiments/x.py", "from experiments.flags import Arguments\nimport jaxnew.training"),
+        ("experiments/reports/x.py", "from experiments.main import child\nimport experiments"),
     ],
 )
-def test_what_the_design_allows_is_allowed(tmp_path: Path, path: str, line: str) -> None:
+def test_what_the_rules_allow_is_allowed(tmp_path: Path, path: str, line: str) -> None:
     file = tmp_path / path
     file.parent.mkdir(parents=True)
     file.write_text(line)
@@ -320,11 +345,62 @@ def test_importing_the_package_imports_nothing_else() -> None:
 
 
 @pytest.mark.unit
-def test_every_exported_name_exists() -> None:
-    jaxnew = importlib.import_module("jaxnew")
-    assert len(jaxnew.__all__) > 10
+def test_a_script_gets_no_command_and_no_flags() -> None:
+    """A task is found, and whatever trains it, without a command; no flag of ours is defined."""
+    loaded = loaded_after(
+        "import sys, jaxnew",
+        "from absl import flags",
+        "assert jaxnew.load_task('grid_world').name == 'grid_world'",
+        "jaxnew.train, jaxnew.embed, jaxnew.sweep, jaxnew.Run",
+        "found = {name for name in sys.modules if name.startswith('experiments')}",
+        "assert found == {'experiments', 'experiments.tasks', 'experiments.tasks.grid_world'}",
+        "modules = flags.FLAGS.flags_by_module_dict()",
+        "assert not [m for m in modules if m.startswith(('experiments', 'jaxnew'))], modules",
+    )
+    assert "envs_mjx" in loaded
+    assert not loaded & {"envs_host", "pymunk", "mujoco"}
+
+
+# The face of the package.
+
+
+@pytest.mark.unit
+def test_every_exported_name_exists_and_is_documented() -> None:
+    assert len(jaxnew.__all__) > 30
     for name in jaxnew.__all__:
-        assert getattr(jaxnew, name).__name__ == name
-    assert set(dir(jaxnew)) == set(jaxnew.__all__)
+        found = getattr(jaxnew, name)
+        assert found.__name__ == name
+        # A dataclass without one of its own is given its signature.
+        assert found.__doc__, name
+        assert not found.__doc__.startswith(f"{name}("), name
+        module = importlib.import_module(found.__module__)
+        assert getattr(module, name) is found
+    assert set(dir(jaxnew)) == {*jaxnew.__all__, "__version__"}
     with pytest.raises(AttributeError, match="nothing"):
         _ = jaxnew.nothing
+
+
+@pytest.mark.unit
+def test_every_exported_name_is_used_by_a_test() -> None:
+    used: set[str] = set()
+    for path in sorted((ROOT / "tests").rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("jaxnew"):
+                used |= {alias.name for alias in node.names}
+            elif isinstance(node, ast.Attribute) and ast.unparse(node.value) == "jaxnew":
+                used.add(node.attr)
+    assert set(jaxnew.__all__) - used == set()
+
+
+@pytest.mark.unit
+def test_the_version_stands_once() -> None:
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    declared = project.get("version", jaxnew.__version__)
+    assert jaxnew.__version__ == declared == importlib.metadata.version("jaxnew")
+
+
+@pytest.mark.unit
+def test_types_travel_with_the_package() -> None:
+    assert (ROOT / "jaxnew" / "py.typed").is_file()
+    settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
+    assert "py.typed" in settings["package-data"]["jaxnew"]

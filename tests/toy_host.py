@@ -7,6 +7,7 @@ pool hands out are overwritten by the next decision of their half, as in shared 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -64,8 +65,11 @@ class ToyPool:
       events: what was called, in order.
     """
 
-    observation_shape, observation_dtype = (SIZE, SIZE), np.dtype(np.uint8)
-    position_dim, episode_metrics = 2, METRICS
+    make_env: Callable[[], Any] = ToyEnv
+    observation_shape: tuple[int, ...] = (SIZE, SIZE)
+    observation_dtype: np.dtype[Any] = np.dtype(np.uint8)
+    episode_metrics: tuple[str, ...] = METRICS
+    position_dim, max_steps = 2, MAX_STEPS
 
     def __init__(
         self, num_envs: int, num_halves: int = 2, seed: int = 0, num_workers: int = 1
@@ -73,11 +77,11 @@ class ToyPool:
         del num_workers
         self.num_envs, self.num_halves, self.seed = num_envs, num_halves, seed
         self.is_numbered = False
-        self.envs = [ToyEnv() for _ in range(num_envs)]
+        self.envs = [self.make_env() for _ in range(num_envs)]
         self.episodes = np.full(num_envs, -1)
         self.log: list[list[tuple[int, np.ndarray]]] = [[] for _ in range(num_envs)]
         self.sent: dict[int, Any] = {}
-        self.out = np.zeros((2, num_envs, SIZE, SIZE), np.uint8)
+        self.out = np.zeros((2, num_envs, *self.observation_shape), self.observation_dtype)
         self.events: list[Any] = []
         self.is_closed = False
 
@@ -110,7 +114,7 @@ class ToyPool:
         assert half not in self.sent
         assert ids.shape == (n,)
         assert ids.dtype == np.int32
-        assert positions.shape == (n, 2)
+        assert positions.shape == (n, self.position_dim)
         assert positions.dtype == np.float32
         self.events.append(("send", half))
         self.sent[half] = ids.copy(), positions.copy()
@@ -138,15 +142,18 @@ class ToyPool:
             np.array(rewards, np.float32),
             np.array(terminated),
             np.array(truncated),
-            {name: np.array([m[name] for m in metrics], np.float32) for name in METRICS},
+            {
+                name: np.array([m[name] for m in metrics], np.float32)
+                for name in self.episode_metrics
+            },
         )
 
     def state_dict(self, num_steps: int | None = None) -> dict[str, np.ndarray]:
         self._check_idle()
-        assert num_steps == MAX_STEPS
+        assert num_steps == self.max_steps
         assert not self.is_numbered
         ids = np.full((num_steps, self.num_envs), -1, np.int32)
-        positions = np.zeros((num_steps, self.num_envs, 2), np.float32)
+        positions = np.zeros((num_steps, self.num_envs, self.position_dim), np.float32)
         for i, log in enumerate(self.log):
             for t, (action_id, position) in enumerate(log):
                 ids[t, i], positions[t, i] = action_id, position

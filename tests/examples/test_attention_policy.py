@@ -10,15 +10,16 @@ import numpy as np
 import pytest
 
 from examples.attention_policy import AttentionMethod
-from jaxnew.policy.method import MethodContext
+from jaxnew.policy.method import MethodContext, PolicyMethod
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.sampling import ActionPool, AvailableSet, draw_sets
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions, AvailableSet
 from tests import probe_environments as probe
 from tests.jaxnew.policy import numpy_policy
 
 NUM_FEATURES, D, M, BATCH = 5, 6, 12, 7
-METHOD = AttentionMethod(MethodContext())
+METHOD: PolicyMethod = AttentionMethod(MethodContext())
 
 # float32 sums of some tens of products of order-one numbers, through three layers.
 TOLERANCE = {"rtol": 2e-5, "atol": 2e-5}
@@ -162,7 +163,6 @@ def test_it_learns_what_unseen_actions_are_worth() -> None:
         rollout=RolloutConfig(
             num_envs=32,
             num_steps=8,
-            set_size=set_size,
             normalize_observations=False,
             normalize_rewards=False,
         ),
@@ -173,18 +173,18 @@ def test_it_learns_what_unseen_actions_are_worth() -> None:
     hyperparameters = Hyperparameters(learning_rate=3e-3, entropy_coefficient=0.01, clip=0.2)
 
     @jax.jit
-    def train(key: jax.Array, pool: ActionPool) -> Any:
+    def train(key: jax.Array, actions: Actions) -> Any:
         mdp = probe.bandit(is_good * 1.0, states)
         rollout = DeviceRollout(probe.TableWorld(num_actions), mdp, METHOD, config.rollout)
         learner = Learner(rollout, config)
-        state = learner.init(key, table, pool)
-        return learner.updates(state, hyperparameters, table, pool, 60)[0].params
+        state = learner.init(key, actions)
+        return learner.updates(state, hyperparameters, actions, 60)[0].params
 
-    params = train(jax.random.key(0), ActionPool.of(np.arange(32), capacity=num_actions))
+    parts = [Actions.of(table, ids, set_size) for ids in (np.arange(32), np.arange(32, 64))]
+    params = train(jax.random.key(0), parts[0])
     shares = []
-    for ids in (np.arange(32), np.arange(32, 64)):
-        pool = ActionPool.of(ids, capacity=num_actions)
-        available = draw_sets(jax.random.split(jax.random.key(99), 200), pool, set_size)
+    for actions in parts:
+        available = actions.draw(jax.random.split(jax.random.key(99), 200))
         for state in range(num_states):
             obs = jnp.broadcast_to(states[state], (200, num_states))
             got = probabilities(params, obs, table[np.asarray(available.ids)], available.mask)

@@ -1,4 +1,4 @@
-"""The pages of `docs/` quote the examples word for word, and their commands run."""
+"""Two pages quote the examples word for word, and their scripts and commands run; links lead on."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from pathlib import Path
 import pytest
 
 from examples.kicks import PLAY
-from experiments.pipeline.artifacts import load_encoder
+from jaxnew.embedding import Encoder
 from tests.experiments.commands import ROOT, read_json, run
 
-PAGES = sorted(ROOT.glob("docs/*.md"))
+DOCS = sorted(ROOT.glob("docs/**/*.md"))
+PAGES = sorted(ROOT.glob("docs/your_own_*.md"))
 TASK_PLACE, METHOD_PLACE = "examples.kicks:TASK", "examples.attention_policy:AttentionMethod"
 
 
@@ -28,6 +29,11 @@ def is_quoted(block: str, source: str) -> bool:
     return any(f"\n{textwrap.indent(lines, ' ' * depth)}" in source for depth in (0, 4, 8))
 
 
+def scripts(page: Path) -> list[str]:
+    """Blocks that are whole scripts; all others are quoted."""
+    return [block for block in blocks(page, "python") if block.startswith("import jaxnew\n")]
+
+
 def commands(page: Path) -> list[list[str]]:
     """The words of every command of the page."""
     lines = "".join(blocks(page, "shell")).replace("\\\n", " ").splitlines()
@@ -36,29 +42,44 @@ def commands(page: Path) -> list[list[str]]:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return tmp_path_factory.mktemp("runs")
+    return tmp_path_factory.mktemp("page") / "runs"
 
 
 def run_page(page: Path, runs: Path) -> str:
     """Runs the page's commands in order, at smoke budget and below `runs`; their output."""
     outputs = []
-    for python, flag, module, *flags in commands(page):
-        assert (python, flag) == ("python", "-m")
+    for jaxnew, name, *flags in commands(page):
+        assert jaxnew == "jaxnew"
         words = [f.replace("laptop", "smoke").replace("=runs/", f"={runs}/") for f in flags]
-        is_evaluation = module == "experiments.evaluate"
-        words.append("--episodes=64" if is_evaluation else f"--runs={runs}")
-        name = module.removeprefix("experiments.")
+        words.append("--episodes=64" if name == "evaluate" else f"--runs={runs}")
         outputs.append(run(name, *words))
     return "".join(outputs)
 
 
+def run_script(page: Path, runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs the page's script likewise."""
+    (script,) = scripts(page)
+    script = script.replace('"laptop"', '"smoke"').replace('"test"])', '"test"], episodes=32)')
+    assert "episodes=32" in script
+    monkeypatch.chdir(runs.parent)
+    exec(compile(script, page.name, "exec"), {})
+
+
 @pytest.mark.unit
-def test_every_page_is_known() -> None:
-    """A third page needs tests of its own; README points to each."""
+def test_every_page_is_found_from_the_front() -> None:
+    """README, or the list of pages that it points to, points to each."""
     assert [page.name for page in PAGES] == ["your_own_domain.md", "your_own_policy.md"]
-    readme = (ROOT / "README.md").read_text()
+    front = (ROOT / "README.md").read_text()
+    listed = ROOT / "docs" / "README.md"
+    contents = ""
+    if listed.exists():
+        assert "](docs/README.md)" in front
+        contents = listed.read_text()
+    for page in ROOT.glob("docs/*.md"):
+        if page != listed:
+            is_linked = f"](docs/{page.name}" in front or f"]({page.name}" in contents
+            assert is_linked, f"Neither README.md nor docs/README.md has a link to {page.name}."
     for page in PAGES:
-        assert f"](docs/{page.name})" in readme
         assert not re.findall(r"^```(?!python|shell|\n)", page.read_text(), re.MULTILINE)
 
 
@@ -66,26 +87,27 @@ def test_every_page_is_known() -> None:
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_python_blocks_stand_in_the_examples(page: Path) -> None:
     sources = [path.read_text() for path in sorted((ROOT / "examples").glob("*.py"))]
-    quoted = blocks(page, "python")
+    quoted = [block for block in blocks(page, "python") if block not in scripts(page)]
     assert len(quoted) >= 3
     for block in quoted:
         assert any(is_quoted(block, source) for source in sources), f"{page.name} quotes:\n{block}"
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+@pytest.mark.parametrize("page", DOCS, ids=lambda page: page.stem)
 def test_what_the_pages_name_exists(page: Path) -> None:
     for file in re.findall(r"`((?:\w+/)+[\w.]+\.(?:py|md))`", page.read_text()):
         assert (ROOT / file).is_file(), file
-    for file in re.findall(r"\]\(((?!http)[^)#]+)\)", page.read_text()):
-        assert (page.parent / file).is_file(), file
+    for file in re.findall(r"\]\(((?!http)[^)#]+)[^)]*\)", page.read_text()):
+        assert (page.parent / file).exists(), file
 
 
 @pytest.mark.integration
-def test_the_domain_from_recordings_to_unseen_actions(runs: Path) -> None:
+def test_the_domain_from_recordings_to_unseen_actions(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     page = ROOT / "docs" / "your_own_domain.md"
-    used = [words[2].removeprefix("experiments.") for words in commands(page)]
-    assert used == ["collect", "embed", "train", "evaluate"]
+    assert [words[1] for words in commands(page)] == ["collect", "embed", "train", "evaluate"]
     output = run_page(page, runs)
     assert "300 actions x 8 recordings" in output
     path = runs / "kicks" / "ours-hvae-default-smoke-31"
@@ -94,18 +116,27 @@ def test_the_domain_from_recordings_to_unseen_actions(runs: Path) -> None:
     assert (result["num_actions"], result["num_episodes"]) == (75, 64)
     assert {"is_success", "is_off_table", "episode_length"} <= set(result["metrics"])
     # The encoder of new actions is found again as well.
-    config, *_, play_format = load_encoder(runs / "kicks" / "embed-hvae-default-smoke-31")
-    assert (config.task, play_format) == (TASK_PLACE, PLAY.format)
+    encoder = Encoder.load(runs / "kicks" / "embed-hvae-default-smoke-31")
+    assert (encoder.config.task, encoder.frozen()[2].format) == (TASK_PLACE, PLAY.format)
+    # And the script is the same, in this process.
+    run_script(page, runs, monkeypatch)
+    said = capsys.readouterr().out
+    assert said.count("already complete") == 2
+    assert re.search(r"test \(32 episodes, sampled\): .*is_success", said)
 
 
 @pytest.mark.integration
-def test_the_policy_is_found_again(runs: Path) -> None:
+def test_the_policy_is_found_again(
+    runs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     page = ROOT / "docs" / "your_own_policy.md"
-    used = [words[2].removeprefix("experiments.") for words in commands(page)]
-    assert used == ["train", "evaluate"]
+    assert [words[1] for words in commands(page)] == ["train", "evaluate"]
     run_page(page, runs)
     path = runs / "kicks" / "examples-attention_policy-AttentionMethod-hvae-default-smoke-31"
     config = read_json(path / "config.json")
     assert (config["task"], config["method"]) == (TASK_PLACE, METHOD_PLACE)
     result = read_json(path / "evaluation" / "test-best-sampled-m20.json")
     assert (result["num_actions"], result["num_episodes"]) == (75, 64)
+    run_script(page, runs, monkeypatch)
+    said = capsys.readouterr().out
+    assert re.search(r"test \(32 episodes, sampled\): .*is_success", said)

@@ -44,7 +44,7 @@ def test_universe() -> None:
 def test_splits() -> None:
     sizes = {}
     for name in TASK.splits:
-        split = TASK.make_split(name, UNIVERSE)
+        split = TASK.splits[name](UNIVERSE, 0)
         split.check(UNIVERSE)
         sizes[name] = [len(split.ids(part)) for part in ("train", "validation", "test")]
     assert sizes == {"default": [150, 75, 75], "right-is-new": [200, 50, 50]}

@@ -1,4 +1,4 @@
-"""The example's environment keeps the promises of style 34, and those of its own documentation."""
+"""The environment of the example keeps the promises of every environment, and its own."""
 
 from __future__ import annotations
 

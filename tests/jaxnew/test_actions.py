@@ -1,4 +1,4 @@
-"""Universes, splits and lists of actions (spec method 2, spec grid_world 2)."""
+"""Universes, splits and lists of actions (docs/method.md, "Splits and action sets")."""
 
 from __future__ import annotations
 
@@ -123,7 +123,7 @@ def test_zero_and_minus_zero_are_the_same_content() -> None:
 @pytest.mark.unit
 @pytest.mark.parametrize(
     ("num_actions", "sizes"),
-    # Spec method 2.1: Grid World, Recommender, Shape Stacking.
+    # Grid World, Recommender, Shape Stacking.
     [(1024, (512, 256, 256)), (10_000, (5000, 2500, 2500)), (810, (405, 202, 203))],
 )
 def test_split_sizes_are_those_of_the_paper(num_actions: int, sizes: tuple[int, ...]) -> None:
@@ -338,7 +338,7 @@ def test_any_split_survives_its_file(
     assert [getattr(loaded, name).tolist() for name in PARTS] == [sorted(part) for part in parts]
 
 
-# Mixtures of seen and unseen actions (spec method 10).
+# Mixtures of seen and unseen actions (docs/method.md, "Difficulty analyses").
 
 
 @pytest.mark.unit

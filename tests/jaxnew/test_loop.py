@@ -14,6 +14,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -30,14 +31,8 @@ from jaxnew.storage.checkpoint import Checkpointer, CheckpointError
 from jaxnew.storage.run_directory import RunDirectory
 
 ROOT = Path(__file__).resolve().parents[2]
-SETTINGS: dict[str, Any] = {
-    "total_steps": 47,
-    "chunk_steps": 5,
-    "checkpoint_every": 10,
-    "evaluate_every": 5,
-    "selection_metric": "validation/success",
-    "title": "toy",
-}
+RHYTHM = loop.Rhythm(total_steps=47, chunk_steps=5, checkpoint_every=10, evaluate_every=5)
+DISPLAY = loop.Display("toy")
 OPTIMIZER = optax.adam(1e-2)
 TRACED: list[int] = []
 
@@ -80,10 +75,13 @@ def evaluate(state: Toy) -> dict[str, float]:
     return {"validation/success": float(np.round(np.sin(float(state.step) / 25), 1)), "other": 1.0}
 
 
-def train(path: Path, **changes: Any) -> loop.LoopResult[Toy]:
-    arguments = {**SETTINGS, "chunk": chunk, "evaluate": evaluate, **changes}
+def train(path: Path, chunk: Any = chunk, **changes: Any) -> loop.LoopResult[Toy]:
+    """Changes of the rhythm, or of other arguments of the loop."""
+    others = {"evaluate": evaluate, "selection_metric": "validation/success"}
+    others |= {name: value for name, value in changes.items() if name not in vars(RHYTHM)}
+    rhythm = replace(RHYTHM, **{name: changes[name] for name in changes if name in vars(RHYTHM)})
     with RunDirectory.open_or_create(path, {"seed": 0}) as run_directory:
-        return loop.run(init(), run_directory=run_directory, **arguments)
+        return loop.run(init(), chunk, run_directory, rhythm, DISPLAY, **others)
 
 
 def reports(path: Path) -> list[dict[str, Any]]:
@@ -126,12 +124,11 @@ def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 def test_an_undisturbed_run(tmp_path: Path) -> None:
     TRACED.clear()
     jax.clear_caches()
-    called: list[int] = []
-    result = train(tmp_path, on_evaluation=lambda step, state, found: called.append(step))
+    result = train(tmp_path)
     assert TRACED == [5, 2]
     assert (result.step, result.was_interrupted, result.was_resumed) == (47, False, False)
     evaluations = [r for r in reports(tmp_path) if "other" in r]
-    assert [r["step"] for r in evaluations] == [5, 10, 15, 20, 25, 30, 35, 40, 45, 47] == called
+    assert [r["step"] for r in evaluations] == [5, 10, 15, 20, 25, 30, 35, 40, 45, 47]
     updates = [r for r in reports(tmp_path) if "loss" in r]
     assert [r["step"] for r in updates] == [5, 10, 15, 20, 25, 30, 35, 40, 45, 47]
     assert all(r["episode/return"] is None for r in updates)
@@ -381,6 +378,9 @@ def test_metrics_that_may_be_nan_are_a_list(tmp_path: Path) -> None:
     ("changes", "text"),
     [
         ({"chunk_steps": 0}, "chunk_steps must be at least 1, got 0"),
+        ({"total_steps": 0}, "total_steps must be at least 1, got 0"),
+        ({"checkpoint_every": -1}, "checkpoint_every must be at least 1, got -1"),
+        ({"evaluate_every": 0}, "evaluate_every must be at least 1, got 0"),
         ({"evaluate_every": None}, "both evaluate and evaluate_every"),
         ({"evaluate": None, "evaluate_every": None}, "needs evaluate"),
         (
@@ -408,35 +408,34 @@ def test_a_run_past_its_end_or_open_for_reading_is_refused(tmp_path: Path) -> No
     with pytest.raises(ValueError, match="at step 10, past total_steps=5"):
         train(tmp_path, total_steps=5)
     with pytest.raises(ValueError, match="open for reading"):
-        loop.run(
-            init(),
-            run_directory=RunDirectory.load(tmp_path),
-            chunk=chunk,
-            total_steps=5,
-            chunk_steps=5,
-            checkpoint_every=5,
-            title="toy",
-        )
+        loop.run(init(), chunk, RunDirectory.load(tmp_path), loop.Rhythm(5, 5, 5), DISPLAY)
+
+
+@struct.dataclass
+class Counter:
+    """Counts with a Python number, and has no `params`."""
+
+    step: int
+    x: np.ndarray
 
 
 @pytest.mark.unit
-def test_other_counters_and_states(tmp_path: Path) -> None:
+def test_other_counters_and_states(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with RunDirectory.open_or_create(tmp_path, {}) as run_directory:
         result = loop.run(
-            {"n": 0, "x": np.zeros(2)},
-            chunk=lambda s, n: ({"n": s["n"] + n, "x": s["x"] + n}, {"loss": 1.0}),
-            run_directory=run_directory,
-            total_steps=7,
-            chunk_steps=3,
-            checkpoint_every=3,
-            title="counting",
-            step_of=lambda s: s["n"],
-            work_per_step=10,
+            Counter(0, np.zeros(2)),
+            lambda s, n: (Counter(s.step + n, s.x + n), {"loss": 1.0}),
+            run_directory,
+            loop.Rhythm(total_steps=7, chunk_steps=3, checkpoint_every=3),
+            loop.Display("counting", "beans", work_per_step=10, work_unit="peas"),
         )
-    assert result.state["n"] == 7
-    assert result.state["x"].tolist() == [7.0, 7.0]
+    assert result.state.step == 7
+    assert result.state.x.tolist() == [7.0, 7.0]
     assert (result.best_metric, result.last_evaluation) == (None, None)
     assert metrics.read(tmp_path)[0]["time/work_per_s"] > 0
+    shown = capsys.readouterr().out
+    assert "counting" in shown
+    assert "beans" in shown
 
 
 def _newest_checkpoint(path: Path) -> str:

@@ -403,6 +403,8 @@ def test_actions_that_cannot_be_are_refused() -> None:
         Actions.of(TABLE, np.arange(31), 2)
     with pytest.raises(ValueError, match="every half of the 7 groups"):
         Actions.of(TABLE, IDS, 4, groups=np.arange(7))
+    with pytest.raises(ValueError, match="padded_size=3 is below set_size=4"):
+        Actions.of(TABLE, IDS, 4, padded_size=3)
     actions = Actions.of(TABLE, IDS, 4)
     for sizes in ((5, 1), (-1, 1), (2, -1)):
         with pytest.raises(ValueError, match=rf"first_size={sizes[0]} must be in 0\.\.4"):

@@ -1,4 +1,4 @@
-"""PPO of spec method 5 and 6, written again as plainly as it can be; an oracle for the learner.
+"""PPO and its networks, written again as plainly as it can be; an oracle for the learner.
 
 Forward pass and loss follow the paper's formulas one transition set at a time (the utility function
 on concatenated features, the table looked up inside the loss) and are differentiated by JAX in
@@ -36,7 +36,7 @@ def _utilities(params: Any, obs: jax.Array, representations: jax.Array) -> jax.A
 def loss(
     params: Any, table: jax.Array, data: dict[str, jax.Array], hp: dict[str, float]
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Total loss of transitions [B, ...] and its parts, from spec method 6."""
+    """Total loss of transitions [B, ...] and its parts."""
     utilities = _utilities(params, data["observation"], table[data["ids"]])
     # Softmax over the real entries only; -inf - (-inf) is kept out of the sums by `where`.
     log_normalizer = jax.scipy.special.logsumexp(utilities, axis=1, where=data["mask"])

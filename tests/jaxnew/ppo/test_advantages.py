@@ -1,4 +1,4 @@
-"""Generalised advantage estimation against its definition as a sum (spec method 6)."""
+"""Generalised advantage estimation against its definition as a sum (docs/method.md, "PPO")."""
 
 from __future__ import annotations
 

@@ -17,8 +17,9 @@ import pytest
 
 from jaxnew.policy import make_method
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.sampling import ActionPool, draw_sets
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions
 from tests import probe_environments as probe
 
 pytestmark = pytest.mark.learning
@@ -31,7 +32,6 @@ CONFIG = PPOConfig(
     rollout=RolloutConfig(
         num_envs=32,
         num_steps=8,
-        set_size=M,
         # Values and rewards stay in the units of the task.
         normalize_observations=False,
         normalize_rewards=False,
@@ -49,22 +49,20 @@ STATES = np.eye(S)
 
 @functools.cache
 def program() -> Any:
-    """A jitted (mdp, pool, key) -> state after 60 updates."""
+    """A jitted (mdp, actions, key) -> state after 60 updates."""
 
     @jax.jit
-    def train(mdp: probe.TableParams, pool: ActionPool, key: jax.Array) -> TrainState:
+    def train(mdp: probe.TableParams, actions: Actions, key: jax.Array) -> TrainState:
         rollout = DeviceRollout(probe.TableWorld(A), mdp, METHOD, CONFIG.rollout)
         learner = Learner(rollout, CONFIG)
-        state = learner.init(key, TABLE, pool)
-        return learner.updates(state, HP, TABLE, pool, 60)[0]
+        return learner.updates(learner.init(key, actions), HP, actions, 60)[0]
 
     return train
 
 
 def train(mdp: probe.TableParams, seed: int = 0) -> Any:
     """Parameters after training with the train actions only."""
-    pool = ActionPool.of(TRAIN, capacity=A)
-    state = program()(mdp, pool, jax.random.key(seed))
+    state = program()(mdp, Actions.of(TABLE, TRAIN, M), jax.random.key(seed))
     assert program()._cache_size() == 1
     return state.params
 
@@ -77,8 +75,7 @@ def values(params: Any) -> np.ndarray:
 def share_of(params: Any, is_good: np.ndarray, ids: np.ndarray) -> np.ndarray:
     """f[S] probability of choosing an action with `is_good` bool[S, A], averaged over sets of `ids`
     that hold one."""
-    pool = ActionPool.of(ids, capacity=A)
-    available = draw_sets(jax.random.split(jax.random.key(99), 200), pool, M)
+    available = Actions.of(TABLE, ids, M).draw(jax.random.split(jax.random.key(99), 200))
     shares = []
     for state in range(S):
         obs = jnp.broadcast_to(jnp.asarray(STATES[state], jnp.float32), (200, S))

@@ -1,4 +1,4 @@
-"""The learner against a plain re-implementation of spec method 6, and what a run relies on."""
+"""The learner against a plain re-implementation (docs/method.md, "PPO"), and what runs rely on."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from jaxnew.policy import make_method
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
 from jaxnew.ppo.learner import reduce_metrics
 from jaxnew.ppo.objective import Minibatch
-from jaxnew.rollout.batch import RolloutBatch
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.sampling import ActionPool, AvailableSet
+from jaxnew.rollout.contract import RolloutBatch, RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions, AvailableSet, SetConfig
 from tests import probe_environments as probe
 from tests.jaxnew.policy import numpy_policy
 from tests.jaxnew.ppo import naive
 
 N, T, A, M, WIDTH, D = 4, 8, 7, 4, 5, 3  # Sets drawn by sorting, which compiles faster.
 CONFIG = PPOConfig(
-    rollout=RolloutConfig(num_envs=N, num_steps=T, set_size=M, padded_set_size=WIDTH),
+    rollout=RolloutConfig(num_envs=N, num_steps=T),
     num_epochs=2,
     num_minibatches=2,
     microbatch_size=4,
@@ -36,7 +36,7 @@ BOOTSTRAPPED = replace(
     time_limits_are_ends=False,
 )
 TABLE = np.random.default_rng(0).normal(size=(A, D)).astype(np.float32)
-POOL = ActionPool.of(np.arange(A), capacity=A)
+ACTIONS = Actions.of(TABLE, np.arange(A), M, padded_size=WIDTH)
 NO_STEP = jnp.int32(0)
 
 
@@ -97,7 +97,7 @@ def as_batch(data: dict[str, np.ndarray]) -> RolloutBatch:
 @pytest.mark.oracle
 @pytest.mark.parametrize("config", [CONFIG, BOOTSTRAPPED], ids=["ends", "bootstrapped"])
 @pytest.mark.parametrize("value_scale", [0.05, 3.0])
-def test_learning_from_two_batches_is_what_the_spec_says(
+def test_learning_from_two_batches_is_what_the_formulas_say(
     params: Any, config: PPOConfig, value_scale: float
 ) -> None:
     """GAE, normalisation, minibatches, both losses, clipping, Adam and its schedule, in one.
@@ -122,7 +122,7 @@ def test_learning_from_two_batches_is_what_the_spec_says(
     for update in (3, 40):  # On the slope and after it: J = 10.
         data = batch_of(params, seed=update, value_scale=value_scale)
         key = jax.random.key(update)
-        *state, metrics = learn(key, *state, as_batch(data), hp, TABLE, jnp.int32(update))
+        *state, metrics = learn(key, *state, as_batch(data), hp, ACTIONS, jnp.int32(update))
 
         learning_rate = 2e-3 * (1 - 0.9 * min(1.0, update / 10))
         np.testing.assert_allclose(metrics["learning_rate"], learning_rate, rtol=1e-6)
@@ -184,7 +184,7 @@ def test_gradient_of_projected_microbatches_is_that_of_the_naive_loss(
     under_test = dict(minibatch)
     available = AvailableSet(under_test.pop("ids"), under_test.pop("mask"))
     grads, parts = jax.jit(learner._gradient)(
-        params, Minibatch(available=available, **under_test), hp, TABLE
+        params, Minibatch(available=available, **under_test), hp, ACTIONS, available
     )
     expected_parts, expected = naive.gradient(params, TABLE, minibatch, hp)
     for name, value in expected_parts.items():
@@ -212,7 +212,7 @@ def test_every_epoch_is_a_fresh_permutation_of_all_transitions() -> None:
 @pytest.mark.parametrize(
     ("num_steps", "lr_steps", "update", "expected"),
     [
-        # Spec method 6: confirmed in a released CREATE checkpoint, J = 8138.
+        # Confirmed in a released CREATE checkpoint, J = 8138.
         (384, 100_000_000, 4849, 4.637e-4),
         # "lr at the end of training": CREATE, Grid World, Recommender, Shape Stacking.
         (384, 100_000_000, 4882, 4.6e-4),
@@ -258,7 +258,7 @@ def test_nonfinite_numbers_are_counted(params: Any, broken: str) -> None:
         learner.optimizer.init(params),
         as_batch(data),
         Hyperparameters(),
-        TABLE,
+        ACTIONS,
         NO_STEP,
     )
     assert metrics["nonfinite/loss"] >= 1
@@ -281,7 +281,7 @@ def updates_of(num_updates: int) -> Any:
 
 @functools.cache
 def initial_state(seed: int) -> TrainState:
-    return jax.jit(learner_of(CONFIG).init)(jax.random.key(seed), TABLE, POOL)
+    return jax.jit(learner_of(CONFIG).init)(jax.random.key(seed), ACTIONS)
 
 
 HP = Hyperparameters()
@@ -296,9 +296,9 @@ def plain(state: TrainState) -> list[np.ndarray]:
 @pytest.mark.property
 def test_two_updates_are_one_and_one_bit_for_bit() -> None:
     """`initial_state` is only read, so that the two ways start alike."""
-    whole, metrics = updates_of(2)(initial_state(0), HP, TABLE, POOL)
-    half, first = updates_of(1)(initial_state(0), HP, TABLE, POOL)
-    halves, second = updates_of(1)(half, HP, TABLE, POOL)
+    whole, metrics = updates_of(2)(initial_state(0), HP, ACTIONS)
+    half, first = updates_of(1)(initial_state(0), HP, ACTIONS)
+    halves, second = updates_of(1)(half, HP, ACTIONS)
     assert int(whole.step) == 2
     for a, b in zip(plain(whole), plain(halves), strict=True):
         np.testing.assert_array_equal(a, b)
@@ -306,6 +306,71 @@ def test_two_updates_are_one_and_one_bit_for_bit() -> None:
     assert not all(np.array_equal(a, b) for a, b in zip(plain(half), plain(halves), strict=True))
     # The key is a constant of the run; what is drawn with it is not.
     assert np.array_equal(jax.random.key_data(whole.key), jax.random.key_data(half.key))
+
+
+@pytest.mark.property
+def test_updates_are_the_same_however_they_are_run() -> None:
+    """Three in one compiled call and three compiled calls: bit for bit. One member under `vmap`
+    is another program, whose roundings Adam's eps dampens: to 1e-5, a hundredth of a step."""
+    learner, state = learner_of(CONFIG), initial_state(0)
+    together, metrics = updates_of(3)(state, HP, ACTIONS)
+    update = jax.jit(learner.update)
+    each = []
+    for _ in range(3):
+        state, found = update(state, HP, ACTIONS)
+        each.append(found)
+    assert update._cache_size() == 1
+    for a, b in zip(plain(together), plain(state), strict=True):
+        np.testing.assert_array_equal(a, b)
+    reduced = reduce_metrics(jax.tree.map(lambda *values: jnp.stack(values), *each))
+    assert set(metrics) == set(reduced)
+    for name, value in reduced.items():
+        np.testing.assert_allclose(metrics[name], value, rtol=1e-6, atol=1e-7, err_msg=name)
+
+    one = jax.tree.map(lambda x: x[None], initial_state(0))
+    mapped = jax.jit(jax.vmap(lambda s: learner.updates(s, HP, ACTIONS, 3)[0]))(one)
+    for a, b in zip(plain(mapped), plain(together), strict=True):
+        np.testing.assert_allclose(a[0], b, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.property
+def test_every_update_draws_numbers_of_its_own() -> None:
+    """What happened in the rollout, which knows neither learning rate nor gradient."""
+    update = jax.jit(learner_of(CONFIG).update)
+    state = initial_state(0)
+    states = [state, replace(state, step=jnp.int32(1)), replace(state, key=jax.random.key(9))]
+    returns = [float(update(s, HP, ACTIONS)[1]["episodes/episode_return"]) for s in states]
+    assert len(set(returns)) == 3
+
+
+@pytest.mark.unit
+def test_compiled_parts_are_compiled_once() -> None:
+    learner = learner_of(CONFIG)
+    state = learner.compiled_init(jax.random.key(0), ACTIONS)
+    for a, b in zip(plain(state), plain(initial_state(0)), strict=True):
+        np.testing.assert_array_equal(a, b)
+    for _ in range(2):
+        state, _ = learner.compiled_updates(state, HP, ACTIONS, num_updates=1)
+    assert int(state.step) == 2
+    assert learner.compiled_updates._cache_size() == 1
+    # Other actions of as many rows run the same program.
+    others = Actions.of(TABLE, np.arange(1, A), M, padded_size=WIDTH)
+    learner.compiled_updates(state, HP, others, num_updates=1)
+    assert learner.compiled_updates._cache_size() == 1
+
+
+@pytest.mark.unit
+def test_shapes_of_what_acts_are_those_of_a_state() -> None:
+    """Without an environment being started; what only training needs is left out."""
+    shapes = learner_of(CONFIG).policy_shapes(ACTIONS)
+    state = initial_state(0)
+    kinds = [jax.tree.map(lambda x: (x.shape, x.dtype), found.policy) for found in (shapes, state)]
+    assert kinds[0] == kinds[1]
+    assert shapes.opt_state is shapes.key is None
+    assert (shapes.step.shape, shapes.step.dtype) == (state.step.shape, state.step.dtype)
+    raw = replace(CONFIG.rollout, normalize_observations=False)
+    statistics = learner_of(replace(CONFIG, rollout=raw)).policy_shapes(ACTIONS).policy
+    assert statistics.observation_statistics is None
 
 
 @pytest.mark.property
@@ -320,11 +385,11 @@ def test_members_of_a_sweep_are_single_runs() -> None:
     states = [initial_state(seed) for seed in (0, 0, 1)]
     stack = lambda *trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
     learner = learner_of(CONFIG)
-    sweep = jax.jit(jax.vmap(lambda *args: learner.updates(*args, 1), in_axes=(0, 0, None, None)))
-    together, metrics = sweep(stack(*states), stack(*members), TABLE, POOL)
+    sweep = jax.jit(jax.vmap(lambda *args: learner.updates(*args, 1), in_axes=(0, 0, None)))
+    together, metrics = sweep(stack(*states), stack(*members), ACTIONS)
     singles = []
     for i, (state, hp) in enumerate(zip(states, members, strict=True)):
-        single, single_metrics = updates_of(1)(state, hp, TABLE, POOL)
+        single, single_metrics = updates_of(1)(state, hp, ACTIONS)
         member = jax.tree.map(lambda x, i=i: x[i], together)
         for a, b in zip(plain(member), plain(single), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-5)
@@ -343,9 +408,9 @@ def test_members_of_a_sweep_are_single_runs() -> None:
     ["learning_rate", "entropy_coefficient", "clip", "discount", "gae_lambda", "value_coefficient"],
 )
 def test_every_hyperparameter_matters(name: str) -> None:
-    base, _ = updates_of(1)(initial_state(0), HP, TABLE, POOL)
+    base, _ = updates_of(1)(initial_state(0), HP, ACTIONS)
     changed_hp = HP.replace(**{name: 0.7 * getattr(HP, name)})
-    changed, _ = updates_of(1)(initial_state(0), changed_hp, TABLE, POOL)
+    changed, _ = updates_of(1)(initial_state(0), changed_hp, ACTIONS)
     # The same program and the same draws, so any difference is the number's. (That of the entropy
     # coefficient is small: the entropy of the first policy is almost at its maximum.)
     leaves = zip(jax.tree.leaves(base.params), jax.tree.leaves(changed.params), strict=True)
@@ -354,7 +419,7 @@ def test_every_hyperparameter_matters(name: str) -> None:
 
 @pytest.mark.unit
 def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
-    """Spec method 6, column Grid World."""
+    """docs/method.md, "PPO", column Grid World."""
     config = PPOConfig()
     assert vars(HP) == {
         "learning_rate": 1e-3,
@@ -367,7 +432,7 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
     assert (config.rollout.num_envs, config.rollout.num_steps) == (32, 512)
     assert (config.num_epochs, config.num_minibatches, config.minibatch_size) == (4, 4, 4096)
     assert (config.lr_steps, config.max_grad_norm) == (40_000_000, 0.5)
-    assert config.rollout.set_size == 50
+    assert SetConfig() == SetConfig(size=50, padded_size=0, is_fixed=False)
     assert config.time_limits_are_ends
 
 

@@ -1,4 +1,4 @@
-"""The PPO loss and its parts against float64 from the formulas of spec method 6."""
+"""The PPO loss and its parts against float64 from the formulas (docs/method.md, "PPO")."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis.extra import numpy as npst
 from jaxnew.policy import UtilityMethod
 from jaxnew.ppo import Hyperparameters
 from jaxnew.ppo.objective import Minibatch, loss, normalize_advantages
-from jaxnew.sampling import AvailableSet
+from jaxnew.sampling import Actions, AvailableSet
 from tests.jaxnew.policy import numpy_policy
 from tests.jaxnew.ppo import naive
 
@@ -33,6 +33,7 @@ def params() -> Any:
 
 
 TABLE = np.random.default_rng(2).normal(size=(A, D)).astype(np.float32)
+ACTIONS = Actions.of(TABLE, np.arange(A), 4, padded_size=M)
 
 
 def transitions(params: Any, seed: int, log_ratio: np.ndarray, change: np.ndarray) -> dict:
@@ -63,10 +64,12 @@ def transitions(params: Any, seed: int, log_ratio: np.ndarray, change: np.ndarra
 def compiled(params: Any, data: dict[str, jax.Array], hp: Hyperparameters) -> Any:
     """((total, parts), gradient) of the loss under test."""
     data = dict(data)
-    minibatch = Minibatch(available=AvailableSet(data.pop("ids"), data.pop("mask")), **data)
+    available = AvailableSet(data.pop("ids"), data.pop("mask"))
+    minibatch = Minibatch(available=available, **data)
 
     def total(params: Any) -> Any:
-        return loss(params, METHOD.project(params, TABLE), minibatch, METHOD, hp)
+        projected = METHOD.project(params, ACTIONS.offered(available))
+        return loss(params, projected, minibatch, available, METHOD, hp, ACTIONS)
 
     return jax.value_and_grad(total, has_aux=True)(params)
 

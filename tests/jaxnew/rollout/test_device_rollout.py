@@ -1,4 +1,4 @@
-"""A rollout re-played in NumPy from its recorded choices (spec method 2.2, 5.1 and 6)."""
+"""A rollout re-played in NumPy from its recorded choices (docs/method.md)."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ import numpy as np
 import pytest
 
 from jaxnew.policy import make_method
-from jaxnew.rollout.batch import RolloutBatch
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig, RolloutState
-from jaxnew.sampling import ActionPool
+from jaxnew.rollout.contract import RolloutBatch, RolloutConfig
+from jaxnew.rollout.device import DeviceRollout, RolloutState
+from jaxnew.sampling import Actions
 from tests import probe_environments as probe
 from tests.jaxnew.policy import numpy_policy
 
 N, T, A, M, WIDTH, D = 5, 11, 24, 4, 6, 3
 DISCOUNT = 0.9
-CONFIG = RolloutConfig(
-    num_envs=N, num_steps=T, set_size=M, padded_set_size=WIDTH, bootstraps_time_limits=True
-)
+CONFIG = RolloutConfig(num_envs=N, num_steps=T, bootstraps_time_limits=True)
 MDP = probe.ladder(A)
-POOL = ActionPool.of(np.arange(2, 22), capacity=A)  # 20 of the 24 actions.
 TABLE = np.random.default_rng(0).normal(size=(A, D)).astype(np.float32)
+ACTIONS = Actions.of(TABLE, np.arange(2, 22), M, padded_size=WIDTH)  # 20 of the 24 actions.
 
 # float32 against float64: some hundred operations on order-one numbers; and the constant feature,
 # whose deviation falls to 1e-3, magnifies roundings of 6e-8 to 6e-5.
@@ -43,13 +41,13 @@ def play(
 ) -> tuple[Any, list[RolloutState], RolloutBatch, list[dict[str, float]]]:
     """Parameters, the states between rollouts, all steps in one batch [K T, N, ...], the sums."""
     rollout, init, collect = rollout_of(config)
-    states = [init(jax.random.key(1), POOL)]
+    states = [init(jax.random.key(1), ACTIONS)]
     params = rollout.method.init(jax.random.key(2), states[0].observation[0], D)
     params = numpy_policy.randomized(params, seed=3)
     batches, sums = [], []
     for k in range(num_rollouts):
         key = jax.random.fold_in(jax.random.key(4), k)
-        state, batch, total = collect(key, states[-1], params, TABLE, POOL, jnp.float32(DISCOUNT))
+        state, batch, total = collect(key, states[-1], params, ACTIONS, jnp.float32(DISCOUNT))
         states.append(state)
         batches.append(batch)
         sums.append({name: float(value) for name, value in total.items()})
@@ -218,10 +216,10 @@ def test_every_episode_has_a_set_of_its_own_however_many_end() -> None:
     config = replace(CONFIG, num_steps=num_steps)
     one_step = replace(MDP, time_limit=jnp.int32(1))
     rollout = DeviceRollout(probe.TableWorld(A), one_step, make_method("ours"), config)
-    state = rollout.init(jax.random.key(1), POOL)
+    state = rollout.init(jax.random.key(1), ACTIONS)
     weights = rollout.method.init(jax.random.key(2), state.observation[0], D)
     _, batch, _ = jax.jit(rollout.collect)(
-        jax.random.key(3), state, weights, TABLE, POOL, jnp.float32(DISCOUNT)
+        jax.random.key(3), state, weights, ACTIONS, jnp.float32(DISCOUNT)
     )
     assert batch.done.all()
     ids = np.asarray(batch.available.ids)[..., :M]
@@ -272,8 +270,6 @@ def test_choices_differ_between_environments_steps_and_rollouts() -> None:
     [
         ({"num_envs": 0}, "num_envs=0 must be at least 1"),
         ({"num_steps": 0}, "num_steps=0 must be at least 1"),
-        ({"set_size": 0}, "set_size=0 must be at least 1"),
-        ({"padded_set_size": 3}, "padded_set_size=3 is below set_size=4.*0"),
     ],
 )
 def test_bad_configs_are_refused(changes: dict[str, int], message: str) -> None:

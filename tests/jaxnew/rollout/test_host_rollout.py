@@ -12,20 +12,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.ppo import Hyperparameters, PPOConfig
-from jaxnew.ppo.host import HostLearner
+from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
 from jaxnew.rollout.frames import FrameHistory
 from jaxnew.rollout.host import HostRollout
 from jaxnew.rollout.pool import HostEnvironments
 from jaxnew.storage.checkpoint import Checkpointer
 from tests import toy_host
 from tests.jaxnew.rollout.host_setup import (
+    ACTIONS,
+    ALL_ACTIONS,
     CONFIG,
+    IDS,
     NO_OP,
     PADDED,
-    POOL,
+    SEEN,
     TABLE,
-    A,
     K,
     M,
     N,
@@ -146,12 +147,13 @@ def test_steps_environments_and_rollouts_draw_of_their_own() -> None:
 
 @pytest.mark.unit
 def test_a_fixed_set_is_stored_once_and_every_method_acts() -> None:
-    config = replace(CONFIG, has_fixed_set=True, num_steps=2)
+    config = replace(CONFIG, num_steps=2)
     for name in ("ours", "discrete", "continuous", "random"):
-        states, (batch,), _ = play(rollout_of(config=config, name=name), 1, name)
-        assert batch.available is None
+        states, (batch,), _ = play(rollout_of(config=config, name=name), 1, name, ALL_ACTIONS)
         assert states[1].available is states[0].available
-        assert states[0].available.ids.shape == (A + 1,)
+        assert batch.available is states[0].available
+        assert batch.available.ids.shape == (len(IDS) + 1,)
+        assert batch.available.mask.tolist() == [True] * len(IDS) + [False]
         assert batch.log_prob.shape == (2, N)
 
 
@@ -161,7 +163,7 @@ def test_going_on_costs_nothing_and_a_checkpoint_is_brought_back() -> None:
     states, batches, _ = play(rollout)
     assert "load_state" not in rollout.environments.pool.events
     key = jax.random.fold_in(jax.random.key(4), 1)
-    again = rollout.collect(key, states[1], params_of(), TABLE, POOL)
+    again = rollout.collect(key, states[1], params_of(), ACTIONS, 0.9)
     assert rollout.environments.pool.events.count("load_state") == 1
     assert_equal(again[:2], (states[2], batches[1]))
 
@@ -172,7 +174,7 @@ def test_a_run_begins_at_the_beginning_every_time() -> None:
     rollout = rollout_of()
     states, _, _ = play(rollout, 1)
     used = rollout.environments.pool
-    assert_equal(rollout.init(jax.random.key(1), POOL), states[0])
+    assert_equal(rollout.init(jax.random.key(1), ACTIONS), states[0])
     assert used.is_closed
 
 
@@ -196,10 +198,10 @@ def test_stacks_are_those_of_the_frames() -> None:
 def test_wrong_configs_and_pools_are_refused() -> None:
     for field in ("normalize_observations", "normalize_rewards"):
         with pytest.raises(ValueError, match=f"ppo.rollout.{field}"):
-            HostRollout(environments_of(), method_of(), replace(CONFIG, **{field: True}))
-    rollout = HostRollout(environments_of(num_envs=4), method_of(), CONFIG)
+            HostRollout(environments_of(), method_of(), replace(CONFIG, **{field: True}), SEEN)
+    rollout = HostRollout(environments_of(num_envs=4), method_of(), CONFIG, SEEN)
     with pytest.raises(ValueError, match="4 environments, the rollout num_envs=8"):
-        rollout.init(jax.random.key(0), POOL)
+        rollout.init(jax.random.key(0), ACTIONS)
 
     class Vectors(toy_host.ToyPool):
         observation_shape = (7,)
@@ -221,13 +223,13 @@ PPO = PPOConfig(
 
 
 @functools.cache
-def learner_of() -> HostLearner:
-    return HostLearner(rollout_of(config=PPO.rollout), PPO)
+def learner_of() -> Learner:
+    return Learner(rollout_of(config=PPO.rollout), PPO)
 
 
-def fresh_learner() -> HostLearner:
+def fresh_learner() -> Learner:
     """With a pool of its own, and the compiled programs of the others."""
-    learner = HostLearner(rollout_of(config=PPO.rollout), PPO)
+    learner = Learner(rollout_of(config=PPO.rollout), PPO)
     learner.__dict__["_learn"] = learner_of()._learn
     return learner
 
@@ -235,9 +237,9 @@ def fresh_learner() -> HostLearner:
 @pytest.mark.property
 def test_four_updates_are_two_and_two_after_a_checkpoint(tmp_path: Path) -> None:
     straight = fresh_learner()
-    state = straight.init(jax.random.key(7), TABLE, POOL)
+    state = straight.init(jax.random.key(7), ACTIONS)
     numbers = Hyperparameters()
-    whole, metrics = straight.updates(state, numbers, TABLE, POOL, 4)
+    whole, metrics = straight.updates(state, numbers, ACTIONS, 4)
     assert int(whole.step) == 4
     assert "episode/is_success" in metrics
     seconds = {name: float(metrics[f"time/{name}_s"]) for name in ("act", "wait", "rollout")}
@@ -246,12 +248,12 @@ def test_four_updates_are_two_and_two_after_a_checkpoint(tmp_path: Path) -> None
     assert metrics["time/learn_s"] > 0.0
 
     first = fresh_learner()
-    half, _ = first.updates(first.init(jax.random.key(7), TABLE, POOL), numbers, TABLE, POOL, 2)
+    half, _ = first.updates(first.init(jax.random.key(7), ACTIONS), numbers, ACTIONS, 2)
     Checkpointer(tmp_path).save("latest", 2, half)
     second = fresh_learner()
-    example = second.init(jax.random.key(0), TABLE, POOL)
+    example = second.init(jax.random.key(0), ACTIONS)
     restored, _ = Checkpointer(tmp_path).restore("latest", example)
-    resumed, _ = second.updates(restored, numbers, TABLE, POOL, 2)
+    resumed, _ = second.updates(restored, numbers, ACTIONS, 2)
     assert_equal(
         jax.tree.map(np.asarray, replace(resumed, key=jax.random.key_data(resumed.key))),
         jax.tree.map(np.asarray, replace(whole, key=jax.random.key_data(whole.key))),
@@ -262,16 +264,16 @@ def test_four_updates_are_two_and_two_after_a_checkpoint(tmp_path: Path) -> None
 def test_frames_teach_what_stacks_teach() -> None:
     """The learner, on the frames of a rollout and on the same observations as an array."""
     learner = fresh_learner()
-    state = learner.init(jax.random.key(7), TABLE, POOL)
+    state = learner.init(jax.random.key(7), ACTIONS)
     _, batch, _ = learner.rollout.collect(
-        jax.random.key(1), state.rollout, state.params, TABLE, POOL
+        jax.random.key(1), state.rollout, state.params, ACTIONS, 0.9
     )
     shape = batch.done.shape
     stacks = batch.observations(jnp.arange(batch.done.size))
     dense = replace(batch, observation=stacks.reshape(*shape, *stacks.shape[1:]))
     results = [
         learner._learn(
-            jax.random.key(2), state.params, state.opt_state, b, Hyperparameters(), TABLE, 0
+            jax.random.key(2), state.params, state.opt_state, b, Hyperparameters(), ACTIONS, 0
         )[0]
         for b in (batch, dense)
     ]

@@ -1,4 +1,4 @@
-"""Running statistics against float64 NumPy (spec method 5.1)."""
+"""Running statistics against float64 NumPy (docs/method.md, "Normalisation")."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def update_all(statistics: RunningStatistics, batches: jax.Array) -> RunningStat
 
 def expected_moments(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean and population variance of values f[n, ...] and the prior: 1e-4 values with mean 0 and
-    variance 1 (the initial count of the spec), in float64."""
+    variance 1, in float64."""
     values = values.astype(np.float64)
     count, prior = len(values), 1e-4
     mean = values.sum(axis=0) / (count + prior)
@@ -112,7 +112,7 @@ def test_long_stream_stays_accurate() -> None:
 @pytest.mark.property
 @pytest.mark.parametrize("constant", [0.0, 1.0, 2.0, -3.0])
 def test_constant_features_become_zero(constant: float) -> None:
-    """Spec grid_world 4: walls (id 2) become 0, here to a hundredth of a deviation.
+    """As Grid World's walls, which are 2 in every state: to a hundredth of a deviation.
 
     At first the prior's share of the mean, 1e-4 |c| / n, over its share of the deviation,
     sqrt(1e-4 (1 + c^2) / n), leaves at most 0.01 / sqrt(n) with n >= 32. Later the mean stands

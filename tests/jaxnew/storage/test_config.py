@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from jaxnew.storage.config import ConfigError, differences, from_dict, set_path, set_paths, to_dict
+from jaxnew.storage.config import ConfigError, differences, from_dict, set_paths, to_dict, vary
 
 
 @dataclass(frozen=True)
@@ -111,12 +111,31 @@ def test_an_edit_changes_one_field_only(run: Run, seed: int, rate: float) -> Non
         ("probe=none", "probe", None),
     ],
 )
-def test_set_path_reads_text_by_type(assignment: str, path: str, value: Any) -> None:
-    found: Any = set_path(Run(), assignment)
+def test_text_is_read_by_type(assignment: str, path: str, value: Any) -> None:
+    found: Any = set_paths(Run(), [assignment])
     for name in path.split("."):
         found = getattr(found, name)
     assert found == value
     assert type(found) is type(value)
+
+
+@pytest.mark.property
+@settings(max_examples=100, deadline=None)
+@given(runs(), runs())
+def test_values_and_their_texts_are_set_alike(run: Run, other: Run) -> None:
+    """Every field of a group at once; texts are stripped, as on a command line."""
+    values = {
+        f"ppo.optimizer.{field.name}": getattr(other.ppo.optimizer, field.name)
+        for field in dataclasses.fields(Optimizer)
+    }
+    values |= {"seed": other.seed, "ppo.layers": other.ppo.layers, "ppo.window": other.ppo.window}
+    texts = [f" {path} = {str(value).strip('()')}" for path, value in values.items()]
+    edited = set_paths(run, values)
+    assert edited == set_paths(run, texts)
+    assert edited.ppo.optimizer == other.ppo.optimizer
+    by_name = {path.replace(".", "__"): value for path, value in values.items()}
+    assert vary(run, by_name) == edited
+    assert edited.name == run.name
 
 
 @pytest.mark.unit
@@ -145,9 +164,28 @@ def test_set_path_reads_text_by_type(assignment: str, path: str, value: Any) -> 
 )
 def test_wrong_edits_say_what_is_legal(assignment: str, parts: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
-        set_path(Run(), assignment)
+        set_paths(Run(), [assignment])
     for part in parts:
         assert part in str(caught.value)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("changes", "text"),
+    [
+        ({"seed": 1.5}, "seed must be int, got 1.5 (float)"),
+        ({"seed": True}, "seed must be int, got True (bool)"),
+        ({"ppo.layers": 3}, "ppo.layers must be tuple[int, ...], got 3"),
+        ({"ppo.is_clipped": 1}, "ppo.is_clipped must be bool, got 1"),
+        ({"ppo": {"num_envs": 8}}, "ppo is a group of fields"),
+        ({"ppo.num_env": 8}, "Did you mean ppo.num_envs?"),
+    ],
+)
+def test_values_of_another_type_are_refused(changes: dict[str, Any], text: str) -> None:
+    for edit in (lambda: set_paths(Run(), changes), lambda: vary(Run(), changes)):
+        with pytest.raises(ConfigError) as caught:
+            edit()
+        assert text in str(caught.value)
 
 
 @pytest.mark.unit

@@ -21,7 +21,7 @@ from jaxnew.storage.run_directory import (
     RunDirectoryInUse,
 )
 
-ROOT = Path(__file__).resolve().parents[2]
+ROOT = Path(__file__).resolve().parents[3]
 CONFIG = {"seed": 1, "ppo": {"rate": 0.5, "layers": (1, 2)}}
 
 

@@ -1,43 +1,40 @@
-"""Evaluation in a pool: the same episodes in pools of any size; training goes on undisturbed."""
+"""Episodes in a pool: the same in pools of any size; training goes on undisturbed."""
 
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
-from jaxnew.host_evaluation import HostEvaluator
+from jaxnew.evaluation import EVALUATION_SEED, measure, play
+from jaxnew.rollout.host import HostRollout
 from jaxnew.rollout.pool import HostEnvironments
-from jaxnew.sampling import ActionPool, draw_sets
+from jaxnew.sampling import Actions
 from tests import toy_host
 from tests.jaxnew.rollout import host_setup as host
 
-M, KEY, EPISODES = 4, jax.random.key(2020), 13
-TABLE, POOL = host.TABLE, host.POOL
-PROGRAMS = ("_draw", "_project", "_act_sampled", "_act_greedy")
+M, KEY, EPISODES = 4, jax.random.key(EVALUATION_SEED), 13
+TABLE = host.TABLE
+ACTIONS = Actions.of(TABLE, host.IDS, M, always_available=host.ALWAYS)
 
 
-@functools.cache
-def compiled(**options: int) -> HostEvaluator:
-    return HostEvaluator(host.environments_of(), host.method_of(), M, width=4, **options)
+def rollout_of(num_envs: int = 4, num_halves: int = 2) -> HostRollout:
+    """Of a pool that need not be as large as training's."""
+    return host.rollout_of(environments=host.environments_of(num_envs, num_halves, seed=1))
 
 
-def evaluator_of(environments: HostEnvironments, **options: int) -> HostEvaluator:
-    first = compiled(**options)
-    evaluator = replace(first, environments=environments)
-    for program in PROGRAMS:
-        evaluator.__dict__[program] = getattr(first, program)
-    return evaluator
-
-
-def run(num_envs: int = 4, num_halves: int = 2, episodes: int = EPISODES, **options: Any) -> Any:
-    is_greedy = options.pop("is_greedy", False)
-    evaluator = evaluator_of(host.environments_of(num_envs, num_halves, seed=1), **options)
-    return evaluator.run(host.params_of(), None, TABLE, POOL, KEY, episodes, is_greedy)
+def run(
+    num_envs: int = 4,
+    num_halves: int = 2,
+    episodes: int = EPISODES,
+    is_greedy: bool = False,
+    actions: Actions = ACTIONS,
+) -> Any:
+    rollout = rollout_of(num_envs, num_halves)
+    return measure(rollout, host.policy_of(), actions, episodes, is_greedy=is_greedy)
 
 
 def seed_of(key: jax.Array) -> int:
@@ -79,7 +76,7 @@ def test_greedy_episodes_are_those_of_the_policy() -> None:
         seed = np.random.SeedSequence(seed_of(KEY), spawn_key=(number,))
         frames = [np.zeros((toy_host.SIZE, toy_host.SIZE), np.uint8)] * 2 + [env.reset(seed)]
         key_set = jax.random.split(jax.random.fold_in(KEY, number), 3)[0]
-        ids = np.asarray(draw_sets(key_set[None], POOL, M).ids[0])
+        ids = np.asarray(ACTIONS.draw(key_set[None]).ids[0])
         assert ids[0] == host.NO_OP
         num_steps = 0
         while True:
@@ -103,26 +100,24 @@ def test_training_goes_on_where_it_was() -> None:
     calm, _, _ = host.play(host.rollout_of())
     rollout = host.rollout_of()
     states, _, _ = host.play(rollout, 1)
-    evaluator = evaluator_of(rollout.environments)
-    first = evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 9)
+    first = rollout.measure(host.policy_of(), ACTIONS, KEY, 9)
     key = jax.random.fold_in(jax.random.key(4), 1)
-    last, _, _ = rollout.collect(key, states[-1], host.params_of(), TABLE, POOL)
+    last, _, _ = rollout.collect(key, states[-1], host.params_of(), host.ACTIONS, 0.9)
     host.assert_equal(last, calm[-1])
-    again = evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 9)
+    again = rollout.measure(host.policy_of(), ACTIONS, KEY, 9)
     host.assert_equal(first, again)
 
 
 @pytest.mark.unit
 def test_halves_rest_when_their_episodes_are_over() -> None:
     """Of five episodes the first of four environments plays two, and the second half two in all."""
-    environments = host.environments_of(4, 2)
-    evaluator = evaluator_of(environments)
-    found = evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 5)["num_steps"]
-    events = environments.pool.events
+    rollout = rollout_of(4, 2)
+    found = rollout.measure(host.policy_of(), ACTIONS, KEY, 5)["num_steps"]
+    events = rollout.environments.pool.events
     assert events[0] == "reset_numbered"
     assert events.count(("send", 1)) == found[2:4].max()
     assert events.count(("send", 0)) == max(found[0] + found[4], found[1])
-    evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 2)
+    rollout.measure(host.policy_of(), ACTIONS, KEY, 2)
     assert events.count(("send", 1)) == found[2:4].max()
 
 
@@ -137,19 +132,37 @@ def test_a_growing_set_starts_small() -> None:
             super().send(half, ids, positions)
 
     pool = HostEnvironments(functools.partial(Watched, 4, 1), toy_host.MAX_STEPS, host.K)
-    evaluator = evaluator_of(pool, first_size=1, growth=3)
-    evaluator.run(host.params_of(), None, TABLE, POOL, KEY, 4)
+    measure(host.rollout_of(environments=pool), host.policy_of(), ACTIONS.growing(1, 3), 4)
     assert taken[0] == [host.NO_OP] * 4
     assert any(action != host.NO_OP for action in taken[1])
 
 
+@pytest.mark.property
+def test_played_episodes_are_those_that_are_measured() -> None:
+    """Number, set, seed and every action: whoever plays them again on one environment sees them."""
+    numbers = run()
+    found = play(rollout_of(), host.policy_of(), ACTIONS, 3, 6)
+    assert [episode.number for episode in found] == list(range(3, 9))
+    for episode in found:
+        for name, values in numbers.items():
+            assert episode.metrics[name] == values[episode.number]
+        assert len(episode.actions) == len(episode.rewards) == episode.metrics["num_steps"]
+        assert set(episode.action_ids) <= set(episode.available_ids.tolist())
+        assert len(episode.available_ids) == M
+        assert episode.states == ()
+        assert episode.seed is not None
+        assert episode.seed.entropy == seed_of(KEY)
+        env = toy_host.ToyEnv()
+        env.reset(episode.seed)
+        for action, reward in zip(episode.actions, episode.rewards, strict=True):
+            *_, metrics = played = env.step(int(action.id), np.asarray(action.position))
+            np.testing.assert_allclose(reward, played[1], rtol=1e-6, atol=1e-6)
+        assert metrics["episode_return"] == pytest.approx(episode.metrics["episode_return"])
+
+
 @pytest.mark.unit
 def test_bad_input_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"first_size=5 must be in 0\.\.4"):
-        HostEvaluator(host.environments_of(), host.method_of(), M, first_size=5)
     with pytest.raises(ValueError, match="num_episodes=0"):
         run(episodes=0)
-    small = ActionPool.of(np.arange(2), capacity=toy_host.NUM_ACTIONS)
-    evaluator = evaluator_of(host.environments_of())
-    with pytest.raises(ValueError, match="Sets of 4 actions cannot be drawn"):
-        evaluator.run(host.params_of(), None, TABLE, small, KEY, 3)
+    with pytest.raises(ValueError, match="count=0"):
+        play(rollout_of(), host.policy_of(), ACTIONS, 0, 0)

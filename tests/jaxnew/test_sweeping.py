@@ -1,0 +1,201 @@
+"""Sweeps from a script: their members are the runs that they stand for."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+from jaxnew.ppo import Hyperparameters
+from jaxnew.representation.table import engineered_table
+from jaxnew.run import Run
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.config import ConfigError
+from jaxnew.storage.metrics import read
+from jaxnew.storage.run_directory import ConfigMismatch
+from jaxnew.sweeping import Runs, SweepProgram, checked_seeds, member_configs, sweep
+from jaxnew.task.domain import Domain
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import TrainConfig
+from jaxnew.trainer import Trainer
+from jaxnew.training import train, train_config
+from tests import toy_device, toy_task
+
+LADDER = toy_device.TASK
+DOMAIN = Domain.of(LADDER)
+TABLE = engineered_table(DOMAIN.universe, "gt3")
+VARY = {"entropy_coefficient": [0.01, 0.5]}
+# One update: rounding may later turn a choice.
+ONE_UPDATE = {"num_updates": 1}
+
+
+@pytest.fixture(scope="module")
+def base() -> TrainConfig:
+    return train_config(DOMAIN, "ours", "gt3", TABLE, LADDER.budget("smoke"), 31)
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory: pytest.TempPathFactory) -> Runs:
+    """Two seeds with two values each."""
+    runs = tmp_path_factory.mktemp("runs")
+    return sweep(LADDER, TABLE, seeds=[3, 4], vary=VARY, budget="smoke", runs=runs, set=ONE_UPDATE)
+
+
+@pytest.mark.unit
+def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
+    vary: Any = {"entropy_coefficient": (0.0, 0.1), "clip": np.array([0.1, 0.2, 0.3])}
+    members = member_configs(base, [1, 2], vary)
+    found = {
+        (m.seed, m.hyperparameters.entropy_coefficient, m.hyperparameters.clip) for m in members
+    }
+    assert len(members) == len(found) == 2 * 2 * 3
+    assert (2, 0.1, 0.3) in found
+    assert all(m.hyperparameters.discount == base.hyperparameters.discount for m in members)
+    assert member_configs(base, [1], {}) == [member_configs(base, [1, 2], {})[0]]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("vary", "says"),
+    [
+        ({"entropy": [0.1]}, "Cannot vary entropy .* entropy_coefficient"),
+        ({"clip": []}, r"Cannot vary clip over \[\]: give at least one value"),
+        ({"discount": [2.0]}, "discount=2.0 must be in"),
+        ({"learning_rate": [-1.0]}, "learning_rate=-1.0 must be in"),
+    ],
+)
+def test_axes_that_cannot_be_varied(base: TrainConfig, vary: Any, says: str) -> None:
+    with pytest.raises(ValueError, match=says):
+        member_configs(base, [1], vary)
+
+
+@pytest.mark.unit
+def test_seeds_are_distinct_and_whole(base: TrainConfig) -> None:
+    assert checked_seeds(range(3)) == [0, 1, 2]
+    for seeds in ([1, 1], []):
+        with pytest.raises(UsageError, match="distinct seeds and at least one"):
+            checked_seeds(seeds)
+    for seed in (-1, 2**32, True):
+        with pytest.raises(ConfigError, match="must be an integer in"):
+            member_configs(base, [seed], {})
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("members", "devices", "at_once", "expected"),
+    [(8, 1, 0, (1, 1)), (8, 4, 0, (4, 1)), (7, 6, 0, (1, 1)), (8, 3, 8, (2, 4)), (6, 4, 1, (3, 1))],
+)
+def test_devices_divide_the_members(
+    base: TrainConfig, members: int, devices: int, at_once: int, expected: tuple[int, int]
+) -> None:
+    trainer: Any = None
+    program = SweepProgram.of(trainer, [base] * members, jax.devices() * devices, at_once)
+    assert (len(program.devices), program.members_at_once) == expected
+
+
+@pytest.mark.integration
+def test_members_are_the_runs_that_they_stand_for(swept: Runs, tmp_path: Path) -> None:
+    """Reloaded, with the metrics of `train` under the same names."""
+    assert swept.path.name == "sweep-ours-gt3"
+    assert swept.selection_metric == "validation/is_success"
+    assert len(swept) == 4
+    for run, row in zip(swept, swept.table(), strict=True):
+        assert str(run.path) == row["path"]
+        number = int(run.path.name)
+        expected_seed, entropy = [3, 4, 3, 4][number], [0.01, 0.01, 0.5, 0.5][number]
+        assert (run.config.seed, row["seed"]) == (expected_seed, expected_seed)
+        assert run.config.hyperparameters.entropy_coefficient == entropy
+        assert row["entropy_coefficient"] == entropy
+    single = train(
+        LADDER,
+        TABLE,
+        budget="smoke",
+        seed=4,
+        workdir=tmp_path / "single",
+        set={**ONE_UPDATE, "hyperparameters.entropy_coefficient": 0.5},
+    )
+    member = Run.load(swept.rows[3]["path"])
+    assert member.config == single.config
+    for one, other in zip(*map(jax.tree.leaves, (member.policy, single.policy)), strict=True):
+        # Roundings of the gradient, which Adam's eps dampens to a hundredth of its step.
+        np.testing.assert_allclose(one, other, rtol=1e-5, atol=1e-5)
+    reports = [
+        {name for report in read(path) for name in report if not name.startswith("time/")}
+        for path in (member.path, single.path)
+    ]
+    assert reports[0] == reports[1]
+    evaluated = [
+        next(r for r in read(path) if "validation/is_success" in r)
+        for path in (member.path, single.path)
+    ]
+    for name in ("train/num_steps", "validation/is_success"):
+        assert evaluated[0][name] == pytest.approx(evaluated[1][name], abs=1e-6)
+
+
+@pytest.mark.integration
+def test_rows_are_those_of_the_runs(swept: Runs) -> None:
+    for row in swept.table():
+        assert set(row) == {
+            *("path", "seed", "best_metric", "best_step", "elapsed_s"),
+            *(field.name for field in fields(Hyperparameters)),
+        }
+        metadata = Checkpointer(Path(row["path"]) / "checkpoints").metadata("best")
+        assert metadata["best_metric"] == row["best_metric"]
+        assert row["best_step"] == 1
+    kept = json.loads((swept.path / "evaluation" / "members.json").read_text())
+    assert kept["members"] == swept.table()
+    best = swept.best()
+    assert best.path == Path(max(swept.rows, key=lambda row: row["best_metric"])["path"])
+    found = best.evaluate(episodes=4, record=False)
+    assert list(found.rows) == ["test"]
+    with pytest.raises(UsageError, match="has no evaluated runs; sweep again to go on"):
+        Runs(swept.path, (), swept.selection_metric).best()
+
+
+@pytest.mark.integration
+def test_a_finished_sweep_is_left_alone(swept: Runs, capsys: pytest.CaptureFixture[str]) -> None:
+    before = {p: p.stat().st_mtime_ns for p in (swept.path / "members").rglob("*")}
+    arguments: dict[str, Any] = {"budget": "smoke", "workdir": swept.path, "set": ONE_UPDATE}
+    again = sweep(LADDER, TABLE, seeds=[3, 4], vary=VARY, **arguments)
+    assert "already complete" in capsys.readouterr().out
+    assert again.table() == swept.table()
+    assert {p: p.stat().st_mtime_ns for p in (swept.path / "members").rglob("*")} == before
+    with pytest.raises(ConfigMismatch, match="members"):
+        sweep(LADDER, TABLE, seeds=[3, 5], vary=VARY, **arguments)
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize(
+    ("arguments", "error", "says"),
+    [
+        ({"task": toy_task.TASK, "table": "gt4"}, UsageError, "of toy run on the host, so its"),
+        ({"method": "our"}, UsageError, "Unknown method 'our'"),
+        ({"seeds": [1, 1]}, UsageError, "distinct seeds"),
+        ({"vary": {"seed": [1]}}, UsageError, "Cannot vary seed"),
+        ({"vary": {"clip": [-1.0]}}, ValueError, "clip=-1.0 must be at least 0"),
+        ({"set": {"sets.size": 30}}, ValueError, "Sets of 30 actions"),
+    ],
+)
+def test_what_cannot_be_swept(
+    tmp_path: Path, arguments: dict[str, Any], error: type[Exception], says: str
+) -> None:
+    given = {"task": LADDER, "table": TABLE, "seeds": [1], "budget": "smoke", **arguments}
+    with pytest.raises(error, match=says):
+        sweep(runs=tmp_path, **given)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.unit
+def test_a_sweep_says_what_it_takes(base: TrainConfig) -> None:
+    """Numbers of all members, one per member, whatever else they share."""
+    configs = member_configs(base, [1, 2], {"clip": [0.1, 0.3]})
+    trainer = Trainer.of(configs[0], LADDER, DOMAIN.split, TABLE)
+    program = SweepProgram.of(trainer, configs, jax.devices()[:1])
+    numbers: Any = program.hyperparameters
+    assert numbers.clip.tolist() == pytest.approx([0.1, 0.1, 0.3, 0.3])
+    assert numbers.discount.shape == (4,)
