@@ -1,7 +1,7 @@
 """Runs of version 0.1.0 load, evaluate, go on, and are told from others.
 
-`run_of_0_1_0.tar.gz` is `experiments.train --representation=gt5 --budget=smoke` of that version with
-its checkpoint of update 2, its metrics up to update 4, and an evaluation of 64 test episodes.
+`run_of_0_1_0.tar.gz` is `experiments.train --representation=gt5 --budget=smoke` of that version
+with its checkpoint of update 2, its metrics up to update 4, and an evaluation of 64 test episodes.
 """
 
 from __future__ import annotations

@@ -154,7 +154,7 @@ def test_rows_are_those_of_the_runs(swept: Runs) -> None:
     found = best.evaluate(episodes=4, record=False)
     assert list(found.rows) == ["test"]
     with pytest.raises(UsageError, match="has no evaluated runs; sweep again to go on"):
-        Runs(swept.path, (), swept.selection_metric).best()
+        Runs(swept.path, (), swept.task).best()
 
 
 @pytest.mark.integration

@@ -13,7 +13,7 @@ from envs_host.create.poses import draw_poses, record_poses
 from envs_host.create.tools import ToolClass, all_tools, no_op_id
 from jaxnew import collection
 from jaxnew.actions import ActionUniverse
-from jaxnew.observations import RecordingFormat
+from jaxnew.observations import RecordingFormat, Recordings
 
 IDS = np.array([next(t.id for t in all_tools() if t.tool_class == c) for c in ToolClass], np.int32)
 
@@ -91,7 +91,7 @@ def test_poses_are_collected_and_gone_on_with(tmp_path: Path) -> None:
             raise KeyboardInterrupt
         return record_poses(seed, ids, num_recordings)
 
-    def collect(path: Path) -> observations.Recordings:
+    def collect(path: Path) -> Recordings:
         return collection.collect(
             path,
             record,
