@@ -194,6 +194,8 @@ class Actions:
         """
         table = jnp.asarray(table)
         if set_size is None:
+            if padded_size or groups is not None:
+                raise ValueError("A fixed set has neither padding nor groups; give a set_size.")
             pool = ActionPool.of(ids, capacity=len(ids), always_available=always_available)
             width = len(ids) + pool.always_available.shape[0]
             return cls(table, pool, int(pool.size) + width - len(ids), width, is_fixed=True)

@@ -403,4 +403,12 @@ def test_the_version_stands_once() -> None:
 def test_types_travel_with_the_package() -> None:
     assert (ROOT / "jaxnew" / "py.typed").is_file()
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    assert "py.typed" in settings["package-data"]["jaxnew"]
+    assert {"py.typed", "*.pyi"} <= set(settings["package-data"]["jaxnew"])
+    stub = ast.parse((ROOT / "jaxnew" / "__init__.pyi").read_text())
+    told = {
+        alias.asname: node.module
+        for node in stub.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert told == jaxnew._HOMES

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import zipfile
-import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,20 +10,9 @@ from typing import Any
 import numpy as np
 
 from jaxnew.actions import ActionSplit, ActionUniverse, SplitMismatch, content_hash
-from jaxnew.storage.files import write_bytes_atomically
+from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
 
 _TEXTS = ("universe_hash", "split_hash", "source", "hash")
-
-# All that `numpy.load` was seen to raise on missing, cut or foreign files.
-_UNREADABLE = (
-    OSError,
-    ValueError,
-    EOFError,
-    AttributeError,
-    TypeError,
-    zipfile.BadZipFile,
-    zlib.error,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -184,7 +171,7 @@ def _read_npz(path: Path) -> dict[str, np.ndarray]:
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
-    except _UNREADABLE as err:
+    except UNREADABLE_NPZ as err:
         raise ValueError(
             f"{path} is missing or damaged ({err}); it must be an .npz file with the arrays `ids` "
             "and `vectors`."

@@ -281,7 +281,7 @@ class DeviceRollout:
         ]
         return {
             name: np.concatenate([block[name] for block in blocks])[:num_episodes]
-            for name in blocks[0]
+            for name in (*self.episode_metrics, "num_steps")
         }
 
     def episodes(

@@ -114,6 +114,11 @@ class TrainConfig:
         for name, low in (("num_updates", 1), ("num_clusters", 0)):
             if getattr(self, name) < low:
                 raise ConfigError(f"{name}={getattr(self, name)} must be at least {low}.")
+        if self.sets.is_fixed and self.num_clusters:
+            raise ConfigError(
+                f"num_clusters={self.num_clusters} needs sets that are drawn, and {self.method} is "
+                "trained with a fixed one; leave out num_clusters."
+            )
 
 
 # Given by arguments of their own, or computed from what was given.

@@ -7,6 +7,7 @@ level. Then fine-tuning, and the studies of the analysis. What is made as elsewh
 from __future__ import annotations
 
 import csv
+import json
 import shutil
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -40,7 +41,7 @@ pytestmark = pytest.mark.integration
 WIDTH = 32  # Of every representation, so that policies share their programs.
 EPISODES = 6
 ACTED_IDS = "tests.experiments.create_probes:acted_ids"
-COMMON = ("--budget=smoke", "--workers=1")
+COMMON = ("--budget=smoke", "--workers=1")  # Of `train` and `finetune`.
 EMBED = "create/embed-{}-default-smoke-31"
 POOL = ("--set=pool.on_worker_death=restart", "--set=pool.max_restarts=3")
 SHORT = ("--set=num_updates=1", "--set=loop.evaluation_episodes=2")
@@ -97,7 +98,7 @@ def embed(folder: Path, *names: str) -> None:
         flags = (f"--representation={name}", f"--set=model.{size}={WIDTH}", f"--runs={folder}")
         # As many as a step of training takes; most of the time is for recording 2,366 tools.
         flags = (*flags, "--observations_per_action=2")
-        jobs.append(("--task=create-push", *COMMON, *flags))
+        jobs.append(("--task=create-push", "--budget=smoke", *flags))
     run_several("embed", jobs)
 
 
@@ -154,8 +155,10 @@ def evaluated_few(runs: Path, trained_few: dict[str, str]) -> dict[str, str]:
     assert trained_few
     twin = runs / "twin"
     shutil.copytree(runs / "push", twin)
-    text = (twin / "config.json").read_text()
-    (twin / "config.json").write_text(text.replace('"create-push"', '"create-push-no-subgoals"'))
+    config = read_json(twin / "config.json")
+    config["task"] = "create-push-no-subgoals"
+    config["environment"]["rewards"]["with_subgoals"] = False
+    (twin / "config.json").write_text(json.dumps(config))
     flags = ("--sets=train", "--episodes=20")
     more = {f"{name} on train": (f"--run={runs / name}", *flags) for name in ("push", "twin")}
     return evaluate(runs, FEW, more)

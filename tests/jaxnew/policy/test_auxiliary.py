@@ -11,15 +11,15 @@ import pytest
 from scipy import stats
 
 from jaxnew.environment import ActionSpec
-from jaxnew.evaluation import Evaluator
+from jaxnew.evaluation import measure
 from jaxnew.policy import Categorical, make_method
 from jaxnew.policy.auxiliary import AuxiliaryMethod, HybridDistribution, HybridSample
 from jaxnew.policy.distributions import Beta
 from jaxnew.policy.method import MethodContext
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool, AvailableSet
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions, AvailableSet
 from tests import probe_environments as probe
 
 N, M, D, K, A, NUM_OBS = 3, 5, 4, 2, 12, 6
@@ -293,24 +293,16 @@ def learned(is_conditioned: bool) -> dict[str, float]:
     env = probe.HybridBandit(NUM, 1, True)
     context = MethodContext(action_spec=env.action_spec, conditions_position=is_conditioned)
     method = make_method("ours", context)
-    rollout = RolloutConfig(num_envs=32, num_steps=16, set_size=SIZE, normalize_observations=False)
-    config = PPOConfig(rollout=rollout, num_minibatches=2, microbatch_size=0, lr_steps=10**9)
+    shapes = RolloutConfig(num_envs=32, num_steps=16, normalize_observations=False)
+    config = PPOConfig(rollout=shapes, num_minibatches=2, microbatch_size=0, lr_steps=10**9)
     numbers = Hyperparameters(learning_rate=3e-3, entropy_coefficient=0.002, clip=0.2)
-    learner = Learner(DeviceRollout(env, WORLD, method, rollout), config)
-    pool = ActionPool.of(np.arange(48, dtype=np.int32), capacity=NUM)
-    table = jnp.asarray(VECTORS)
-    state = jax.jit(learner.init)(jax.random.key(0), table, pool)
-    state, _ = jax.jit(learner.updates, static_argnums=4)(state, numbers, table, pool, 120)
-    evaluator = Evaluator(env, WORLD, method, SIZE, normalize_observations=False)
-    episodes = evaluator.run(
-        state.params,
-        RunningStatistics.zeros((2,)),
-        table,
-        ActionPool.of(np.arange(48, NUM, dtype=np.int32), capacity=NUM),
-        jax.random.key(9),
-        512,
-        True,
-    )
+    rollout = DeviceRollout(env, WORLD, method, shapes)
+    learner = Learner(rollout, config)
+    actions = Actions.of(VECTORS, np.arange(48, dtype=np.int32), SIZE)
+    state = learner.compiled_init(jax.random.key(0), actions)
+    state, _ = learner.compiled_updates(state, numbers, actions, num_updates=120)
+    new = Actions.of(VECTORS, np.arange(48, NUM, dtype=np.int32), SIZE)
+    episodes = measure(rollout, state.policy, new, 512, seed=9, is_greedy=True)
     return {name: float(values.mean()) for name, values in episodes.items()}
 
 

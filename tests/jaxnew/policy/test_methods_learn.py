@@ -8,20 +8,18 @@ they learn the train actions and lose on unseen ones (paper figure 4 in small).
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.evaluation import Evaluator
+from jaxnew.evaluation import measure
 from jaxnew.policy import make_method
 from jaxnew.policy.method import MethodContext
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
-from jaxnew.rollout.device import DeviceRollout, RolloutConfig
-from jaxnew.rollout.normalization import RunningStatistics
-from jaxnew.sampling import ActionPool
+from jaxnew.rollout.contract import RolloutConfig
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.sampling import Actions
 from tests import probe_environments as probe
 
 pytestmark = pytest.mark.learning
@@ -34,7 +32,7 @@ TABLE = TABLE.astype(np.float32)
 IS_GOOD = np.stack([TABLE[:, 0] > np.quantile(TABLE[:, 0], 0.7), TABLE[:, 0] < -0.52])
 WORLD, MDP = probe.TableWorld(A), probe.bandit(IS_GOOD * 1.0, np.eye(S))
 ROLLOUT = RolloutConfig(
-    num_envs=32, num_steps=16, set_size=M, normalize_observations=False, normalize_rewards=False
+    num_envs=32, num_steps=16, normalize_observations=False, normalize_rewards=False
 )
 CONFIG = PPOConfig(rollout=ROLLOUT, num_minibatches=2, microbatch_size=0, lr_steps=10**9)
 NUMBERS = Hyperparameters(learning_rate=3e-3, entropy_coefficient=0.01, clip=0.2)
@@ -44,24 +42,15 @@ NUMBERS = Hyperparameters(learning_rate=3e-3, entropy_coefficient=0.01, clip=0.2
 def success(name: str, has_fixed_set: bool) -> dict[str, float]:
     """Share of good choices after 100 updates: on train sets (or the fixed set), and held out."""
     method = make_method(name, MethodContext(train_ids=TRAIN))
-    config = replace(CONFIG, rollout=replace(ROLLOUT, has_fixed_set=has_fixed_set))
-    learner = Learner(DeviceRollout(WORLD, MDP, method, config.rollout), config)
-    pool = ActionPool.of(TRAIN, capacity=len(TRAIN) if has_fixed_set else A)
-    table = jnp.asarray(TABLE)
-    state = jax.jit(learner.init)(jax.random.key(0), table, pool)
-    state, _ = jax.jit(learner.updates, static_argnums=4)(state, NUMBERS, table, pool, 100)
+    rollout = DeviceRollout(WORLD, MDP, method, ROLLOUT)
+    learner = Learner(rollout, CONFIG)
+    actions = Actions.of(TABLE, TRAIN, None if has_fixed_set else M)
+    state = learner.compiled_init(jax.random.key(0), actions)
+    state, _ = learner.compiled_updates(state, NUMBERS, actions, num_updates=100)
     found = {}
     for part, ids in (("train", TRAIN), ("held out", HELD_OUT)):
         size = len(TRAIN) if has_fixed_set and part == "train" else M
-        evaluator = Evaluator(WORLD, MDP, method, size, normalize_observations=False)
-        episodes = evaluator.run(
-            state.params,
-            RunningStatistics.zeros((S,)),
-            table,
-            ActionPool.of(ids, capacity=A),
-            jax.random.key(9),
-            1024,
-        )
+        episodes = measure(rollout, state.policy, Actions.of(TABLE, ids, size), 1024, seed=9)
         found[part] = float(episodes["is_success"].mean())
     return found
 

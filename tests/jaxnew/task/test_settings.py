@@ -88,7 +88,7 @@ CHOICES = {
     "ppo.max_grad_norm": numbers,
     "ppo.rollout.normalize_rewards": st.booleans(),
     "sets.size": st.integers(1, 99),
-    "sets.is_fixed": st.booleans(),
+    "sets.is_fixed": st.just(False),  # A fixed set has no clusters.
     "hyperparameters.learning_rate": st.floats(0, 1),
     "hyperparameters.entropy_coefficient": st.floats(0, 1e9),
     "hyperparameters.discount": st.floats(0, 1),
@@ -170,6 +170,7 @@ def test_what_follows_says_from_what(path: str, says: str) -> None:
         ({"hyperparameters.clip": float("nan")}, "must be a finite float"),
         ({"num_updates": 0}, "num_updates=0 must be at least 1"),
         ({"num_clusters": -1}, "num_clusters=-1 must be at least 0"),
+        ({"num_clusters": 3, "sets.is_fixed": True}, "num_clusters=3 needs sets that are drawn"),
         ({"sets.size": 0}, "size=0 must be at least 1"),
         ({"loop.chunk_updates": 0}, "chunk_updates=0 must be at least 1"),
         ({"loop.evaluation_set_size": -1}, "evaluation_set_size=-1 must be at least 0"),
