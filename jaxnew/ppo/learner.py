@@ -68,7 +68,9 @@ class Learner(GradientSteps):
             key_rollout, state.rollout, state.params, actions, hyperparameters.discount
         )
         collected = time.perf_counter()
-        params, opt_state, metrics = self._learn(
+        # Inside a compiled update, as a part of it; beside the host, as a function of its own.
+        learn = self.learn if self.rollout.is_traced else self._compiled_learn
+        params, opt_state, metrics = learn(
             key_learn,
             state.params,
             state.opt_state,
@@ -143,7 +145,7 @@ class Learner(GradientSteps):
         return jax.jit(init)
 
     @cached_property
-    def _learn(self) -> Any:
+    def _compiled_learn(self) -> Any:
         return jax.jit(self.learn)
 
 
