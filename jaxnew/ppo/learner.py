@@ -83,8 +83,8 @@ class Learner(GradientSteps):
             metrics[name if name.startswith(TIME_PREFIX) else f"episodes/{name}"] = value
         if not self.rollout.is_traced:
             jax.block_until_ready(metrics)
-            metrics[f"{TIME_PREFIX}rollout_s"] = collected - start
-            metrics[f"{TIME_PREFIX}learn_s"] = time.perf_counter() - collected
+            metrics[f"{TIME_PREFIX}rollout_s"] = jnp.float32(collected - start)
+            metrics[f"{TIME_PREFIX}learn_s"] = jnp.float32(time.perf_counter() - collected)
         next_state = TrainState(params, opt_state, rollout, state.key, state.step + 1)
         return next_state, metrics
 
