@@ -329,7 +329,7 @@ def embed(
         learned.play,
         preset.stores_drawn if stores_drawn is None else stores_drawn,
     )
-    base = _config(domain, representation, preset, recordings.recorded.hash, seed)
+    base = _config(domain, representation, learned.kind, preset, recordings, seed)
     config = with_set(base, set)
     title = f"embed-{representation}-{domain.split_label}-{budget}-{seed}"
     path = Path(workdir) if workdir else domain.actions_folder(Path(runs)) / title
@@ -345,8 +345,9 @@ def embed(
 def _config(
     domain: Domain,
     representation: str,
+    kind: str,
     preset: StageOneBudget,
-    observations_hash: str,
+    recordings: PlayRecordings,
     seed: int,
 ) -> EmbedConfig:
     """The config of a run of a preset, before anything is set."""
@@ -358,11 +359,11 @@ def _config(
         split=domain.split_name,
         split_seed=domain.split_seed,
         split_hash=split.hash,
-        observations_hash=observations_hash,
+        observations_hash=recordings.recorded.hash,
         seed=seed,
         train_on=train_on,
         model=preset.config(
-            parse_representation(domain, representation).kind,
+            kind,
             len(_with_always_available(split, train_on)),
             len(_with_always_available(Domain.of(task).split, "train")),
         ),
