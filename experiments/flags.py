@@ -55,14 +55,18 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
         "Recordings per action; default: what the budget says.",
     ),
     "frames": (
-        "string",
+        "enum",
         None,
         "Of videos: on-demand draws the frames of each batch while the batch before is learned "
         "from, stored draws all frames once and stores them. The result is the same; default: what "
         "the budget says.",
     ),
 }
-_AT_LEAST = {"workers": 0, "observations_per_action": 1}
+_OPTIONS: dict[str, dict[str, Any]] = {
+    "workers": {"lower_bound": 0},
+    "observations_per_action": {"lower_bound": 1},
+    "frames": {"choices": ["on-demand", "stored"]},
+}
 
 
 class Arguments:
@@ -79,8 +83,7 @@ class Arguments:
         self._texts: dict[str, str] = {}
         for name in shared:
             kind, default, text = _SHARED[name]
-            limits = {"lower_bound": _AT_LEAST[name]} if name in _AT_LEAST else {}
-            self.define(kind, name, default, text, **limits)
+            self.define(kind, name, default, text, **_OPTIONS.get(name, {}))
         self.define("bool", "debug_nans", False, "Stop at the operation that makes a NaN.")
 
     def define(self, kind: str, name: str, default: Any, text: str, **options: Any) -> None:
@@ -117,13 +120,7 @@ class Arguments:
 
     @property
     def stores_drawn(self) -> bool | None:
-        """What `--frames` says; None if nothing.
-
-        Raises:
-          UsageError: something else than what it may say.
-        """
-        if self.frames not in (None, "on-demand", "stored"):
-            raise UsageError(f"--frames={self.frames} must be on-demand or stored.")
+        """What `--frames` says; None if nothing."""
         return None if self.frames is None else bool(self.frames == "stored")
 
     def parse(self, arguments: list[str]) -> None:
