@@ -230,7 +230,7 @@ def learner_of() -> Learner:
 def fresh_learner() -> Learner:
     """With a pool of its own, and the compiled programs of the others."""
     learner = Learner(rollout_of(config=PPO.rollout), PPO)
-    learner.__dict__["_learn"] = learner_of()._learn
+    learner.__dict__["_compiled_learn"] = learner_of()._compiled_learn
     return learner
 
 
@@ -272,7 +272,7 @@ def test_frames_teach_what_stacks_teach() -> None:
     stacks = batch.observations(jnp.arange(batch.done.size))
     dense = replace(batch, observation=stacks.reshape(*shape, *stacks.shape[1:]))
     results = [
-        learner._learn(
+        learner._compiled_learn(
             jax.random.key(2), state.params, state.opt_state, b, Hyperparameters(), ACTIONS, 0
         )[0]
         for b in (batch, dense)
