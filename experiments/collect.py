@@ -3,22 +3,47 @@
     python -m experiments.collect --task=grid_world --budget=laptop
     python -m experiments.collect --task=create-push --representation=hvae-video --frames=stored
 
+    python -m experiments.collect --task=create-push --universe=3-degrees --ids=new --output=new.npz
+
 Recordings of another kind than the task's first are asked for by a representation that is learned
-from them.
+from them. The last form records some actions, of any universe, into one file that an encoder reads.
 """
 
 from __future__ import annotations
 
 from experiments.flags import Arguments
-from jaxnew.embedding import collect, parse_representation
+from jaxnew.observations import Recordings
+from jaxnew.recording import collect, parse_representation, record
 from jaxnew.task.domain import Domain, load_task
 
 ARGUMENTS = Arguments(
-    __doc__, "task", "representation", "budget", "runs", "observations_per_action", "frames"
+    __doc__, "task", "representation", "budget", "runs", "recordings", "frames", "universe"
 )
+ARGUMENTS.define(
+    "string",
+    "ids",
+    "all",
+    "Actions to record into --output: all, new (those that the task's own universe lacks), train, "
+    "validation, test, or a file of ids.",
+)
+ARGUMENTS.define("string", "output", None, "One file (.npz) for the recordings; resumable.")
 
 
 def main() -> None:
+    if ARGUMENTS.output is not None:
+        ARGUMENTS.refuse(["runs", "frames"], "with --output, which makes one file")
+        made = record(
+            ARGUMENTS.task,
+            ARGUMENTS.ids,
+            output=ARGUMENTS.output,
+            universe=ARGUMENTS.universe,
+            representation=ARGUMENTS.representation if ARGUMENTS.is_given("representation") else "",
+            num_recordings=ARGUMENTS.recordings,
+            budget=ARGUMENTS.budget,
+        )
+        describe(made)
+        return
+    ARGUMENTS.refuse(["ids", "universe"], "without --output")
     domain = Domain.of(load_task(ARGUMENTS.task))
     play = domain.play
     if ARGUMENTS.is_given("representation"):
@@ -28,16 +53,21 @@ def main() -> None:
     recordings = collect(
         domain,
         ARGUMENTS.runs,
-        ARGUMENTS.observations_per_action or budget.num_recordings,
+        ARGUMENTS.recordings or budget.num_recordings,
         play,
         budget.stores_drawn if stores_drawn is None else stores_drawn,
     )
-    for made in (recordings.recorded, recordings.drawn):
-        if made is not None:
-            print(
-                f"{made.num_actions} actions x {made.num_recordings} recordings of "
-                f"{made.format.shape} {made.format.dtype}, hash {made.hash}."
-            )
+    for each in (recordings.recorded, recordings.drawn):
+        if each is not None:
+            describe(each)
+
+
+def describe(recordings: Recordings) -> None:
+    """Prints what was recorded."""
+    print(
+        f"{recordings.num_actions} actions x {recordings.num_recordings} recordings of "
+        f"{recordings.format.shape} {recordings.format.dtype}, hash {recordings.hash}."
+    )
 
 
 if __name__ == "__main__":

@@ -12,8 +12,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from experiments.flags import Arguments
-from jaxnew.embedding import REPRESENTATION_SEED, Encoder, embed
+from jaxnew.embedding import Encoder, embed
 from jaxnew.observations import Recordings
+from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.task.places import UsageError
 
 ARGUMENTS = Arguments(
@@ -28,7 +29,7 @@ ARGUMENTS = Arguments(
     "runs",
     "overwrite",
     "set",
-    "observations_per_action",
+    "recordings",
     "frames",
 )
 ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
@@ -53,7 +54,7 @@ def main() -> None:
             split=ARGUMENTS.split,
             split_seed=ARGUMENTS.split_seed,
             set=ARGUMENTS.set,
-            num_recordings=ARGUMENTS.observations_per_action,
+            num_recordings=ARGUMENTS.recordings,
             stores_drawn=ARGUMENTS.stores_drawn,
             workdir=ARGUMENTS.path,
             runs=ARGUMENTS.runs,

@@ -18,7 +18,7 @@ from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run
 from jaxnew.task.places import UsageError
 
-ARGUMENTS = Arguments(__doc__, "workers", "set")
+ARGUMENTS = Arguments(__doc__, "workers", "set", "universe")
 ARGUMENTS.define("string", "run", None, "Run directory of train, or a checkpoint in it.")
 ARGUMENTS.define(
     "enum",
@@ -40,6 +40,13 @@ ARGUMENTS.define(
 ARGUMENTS.define("integer", "growth", 1, "Actions that a growing set gains at every step.")
 ARGUMENTS.define("string", "ids", None, "File of action ids to draw sets from.")
 ARGUMENTS.define("string", "table", None, ".npz table whose actions are drawn and represented.")
+ARGUMENTS.define(
+    "list",
+    "allow",
+    [],
+    "Of --table: other-encoder (its vectors are not those of the run's encoder), unknown-actions "
+    "(it does not say what its actions are; its ids are those of the universe).",
+)
 ARGUMENTS.define("float", "unseen_ratio", None, "Share of test actions among train ones.")
 ARGUMENTS.define("integer", "evaluation_seed", EVALUATION_SEED, "Seed of the episodes.")
 
@@ -71,12 +78,19 @@ def drawn_from(run: Run) -> dict[str, Any]:
             "Give one of --sets, --ids, --table, --unseen_ratio; each of them says where sets come "
             "from."
         )
+    if ARGUMENTS.table is None:
+        ARGUMENTS.refuse(["universe", "allow"], "without --table")
     if ARGUMENTS.ids is not None:
         path = Path(ARGUMENTS.ids)
         return {"ids": {f"ids-{path.stem}": load_ids(path, run.task.make_universe())}}
     if ARGUMENTS.table is not None:
         path = Path(ARGUMENTS.table)
-        return {"table": RepresentationTable.load(path), "table_name": path.stem}
+        return {
+            "table": RepresentationTable.load(path),
+            "table_name": path.stem,
+            "universe": ARGUMENTS.universe,
+            "allow": ARGUMENTS.allow,
+        }
     if ARGUMENTS.unseen_ratio is not None:
         return {"unseen_ratio": ARGUMENTS.unseen_ratio}
     return {"parts": ARGUMENTS.sets}

@@ -49,10 +49,16 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
         "path.to.field=value, for any field of the config, those of the environment "
         "(environment.FIELD) included; pool.FIELD=value says how environments on the host are run.",
     ),
-    "observations_per_action": (
+    "recordings": (
         "integer",
         None,
         "Recordings per action; default: what the budget says.",
+    ),
+    "universe": (
+        "string",
+        "",
+        "Whose actions: another list of the domain (CREATE: 15-degrees, 3-degrees), or a file of "
+        "one's own (skills, shapes); default: the task's own.",
     ),
     "frames": (
         "enum",
@@ -64,7 +70,7 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
 }
 _OPTIONS: dict[str, dict[str, Any]] = {
     "workers": {"lower_bound": 0},
-    "observations_per_action": {"lower_bound": 1},
+    "recordings": {"lower_bound": 1},
     "frames": {"choices": ["on-demand", "stored"]},
 }
 

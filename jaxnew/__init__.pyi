@@ -3,7 +3,6 @@
 from jaxnew.actions import ActionSplit as ActionSplit
 from jaxnew.actions import ActionUniverse as ActionUniverse
 from jaxnew.embedding import Encoder as Encoder
-from jaxnew.embedding import collect as collect
 from jaxnew.embedding import embed as embed
 from jaxnew.environment import Action as Action
 from jaxnew.environment import Environment as Environment
@@ -15,6 +14,8 @@ from jaxnew.policy.method import make_method as make_method
 from jaxnew.ppo import Hyperparameters as Hyperparameters
 from jaxnew.ppo import Learner as Learner
 from jaxnew.ppo import PPOConfig as PPOConfig
+from jaxnew.recording import collect as collect
+from jaxnew.recording import record as record
 from jaxnew.representation.config import RepresentationConfig as RepresentationConfig
 from jaxnew.representation.learner import RepresentationLearner as RepresentationLearner
 from jaxnew.representation.table import RepresentationTable as RepresentationTable

@@ -9,8 +9,10 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sized
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Self
 
 import numpy as np
 
@@ -19,6 +21,15 @@ SPLIT_NAMES = ("train", "validation", "test")
 
 class SplitMismatch(ValueError):
     """Two artefacts belong to different universes or splits."""
+
+
+def check_same(what: str, found: str, recorded: str, where: object) -> None:
+    """Raises SplitMismatch unless the hash of what was read is the one on record."""
+    if found != recorded:
+        raise SplitMismatch(
+            f"The {what} in {where} is not the run's own: its hash is {found}, on record is "
+            f"{recorded}. Put the run's own back; tables of new actions are for evaluate --table."
+        )
 
 
 def content_hash(*parts: np.ndarray | str | int) -> str:
@@ -88,11 +99,88 @@ class ActionUniverse:
         """Identifies the universe by name and by what each action does."""
         return content_hash(self.name, np.asarray(self.content))
 
-    def content_keys(self) -> list[bytes]:
-        """One key per action; equal keys mean equal actions (-0.0 and 0.0 are equal)."""
+    @cached_property
+    def action_hashes(self) -> tuple[str, ...]:
+        """A hashes of what each action does; equal ones mean equal actions (-0.0 is 0.0)."""
         without_minus_zero = self.content + np.zeros((), self.content.dtype)
-        rows = np.ascontiguousarray(without_minus_zero).reshape(self.num_actions, -1)
-        return [row.tobytes() for row in rows]
+        return tuple(content_hash(np.asarray(row)) for row in without_minus_zero)
+
+    def first(self, num_actions: int) -> ActionUniverse:
+        """The universe of the first actions alone: what it was before it has grown."""
+        n = num_actions
+        return replace(
+            self,
+            class_labels=self.class_labels[:n],
+            primary_parameter=self.primary_parameter[:n],
+            action_names=self.action_names[:n],
+            content=self.content[:n],
+            engineered={name: vectors[:n] for name, vectors in self.engineered.items()},
+        )
+
+
+@dataclass(frozen=True)
+class ActionIdentity:
+    """What some actions are, whatever their numbers; it travels with what is made from them.
+
+    Attributes:
+      universe: `ActionUniverse.name` of the universe that they were taken from.
+      place: what `Task.with_universe` takes to find it again; empty for a task's own.
+      names: n printable names.
+      hashes: n of `ActionUniverse.action_hashes`.
+    """
+
+    universe: str
+    place: str
+    names: tuple[str, ...]
+    hashes: tuple[str, ...]
+
+    @classmethod
+    def of(cls, universe: ActionUniverse, ids: np.ndarray, place: str = "") -> Self:
+        """Of the actions `ids` int[n] of a universe."""
+        chosen = np.asarray(ids).tolist()
+        names, hashes = universe.action_names, universe.action_hashes
+        return cls(
+            universe.name, place, tuple(names[i] for i in chosen), tuple(hashes[i] for i in chosen)
+        )
+
+    def rows(self, rows: np.ndarray) -> Self:
+        """Of some of the actions, by place in this list."""
+        chosen = np.asarray(rows).tolist()
+        return replace(
+            self,
+            names=tuple(self.names[row] for row in chosen),
+            hashes=tuple(self.hashes[row] for row in chosen),
+        )
+
+    def find(self, ids: np.ndarray, universe: ActionUniverse) -> np.ndarray:
+        """int32[n] the same actions in another universe, -1 where it lacks one.
+
+        Args:
+          ids: int[n] their numbers, which they keep where they may.
+        """
+        known = universe.action_hashes
+        places: dict[str, list[int]] = {}
+        for number, key in enumerate(known):
+            places.setdefault(key, []).append(number)
+        found = np.full(len(self.hashes), -1, np.int32)
+        for row, number in enumerate(np.asarray(ids).tolist()):
+            same = places.get(self.hashes[row], [])
+            if same:
+                found[row] = same.pop(same.index(number) if number in same else 0)
+        return found
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """As arrays of a file; see `from_arrays`."""
+        return {f"action_{name}": np.array(value) for name, value in vars(self).items()}
+
+    @classmethod
+    def from_arrays(cls, arrays: Mapping[str, np.ndarray]) -> Self | None:
+        """What `arrays` gave, or None for a file that does not say what its actions are."""
+        if "action_hashes" not in arrays:
+            return None
+        universe, place = (str(arrays[f"action_{name}"]) for name in ("universe", "place"))
+        names, hashes = (tuple(arrays[f"action_{name}"].tolist()) for name in ("names", "hashes"))
+        return cls(universe, place, names, hashes)
 
 
 @dataclass(frozen=True)
@@ -155,8 +243,8 @@ class ActionSplit:
                 f"The split was made for universe {self.universe_hash}, but {universe.name} is "
                 f"{universe.hash}. Make the split again from this universe."
             )
-        keys = universe.content_keys()
-        owner: dict[bytes, str] = {}
+        keys = universe.action_hashes
+        owner: dict[str, str] = {}
         for name in (*SPLIT_NAMES, "always_available"):
             ids = getattr(self, name)
             outside = ids[(ids < 0) | (ids >= universe.num_actions)]
@@ -228,8 +316,8 @@ def random_halves_split(universe: ActionUniverse, seed: int) -> ActionSplit:
 
 def _group_by_content(universe: ActionUniverse) -> list[int]:
     """The group number of each action; actions with equal content share one."""
-    first_seen: dict[bytes, int] = {}
-    return [first_seen.setdefault(key, len(first_seen)) for key in universe.content_keys()]
+    first_seen: dict[str, int] = {}
+    return [first_seen.setdefault(key, len(first_seen)) for key in universe.action_hashes]
 
 
 def mixture_ids(seen: np.ndarray, unseen: np.ndarray, unseen_ratio: float) -> np.ndarray:

@@ -18,7 +18,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from jaxnew.actions import ActionUniverse, content_hash
+from jaxnew.actions import ActionIdentity, ActionUniverse, content_hash
 from jaxnew.observations import (
     ObservationsError,
     RecordingFormat,
@@ -131,7 +131,8 @@ def load(path: Path | str, universe: ActionUniverse, verify: bool = True) -> Rec
                 f"{path}: the recording of action {ids[row]} {problem}. Run collect again to "
                 "repair it."
             )
-    return Recordings(data, ids, format, universe.hash, tuple(hashes))
+    identity = ActionIdentity.of(universe, ids)
+    return Recordings(data, ids, format, universe.hash, tuple(hashes), identity)
 
 
 def _wait_for_lock(path: Path) -> int:

@@ -1,7 +1,4 @@
-"""Stage one: recordings of every action, an encoder that is trained on them, and its table.
-
-Made on demand, and said beforehand.
-"""
+"""Stage one: an encoder that is trained on recordings of actions, and its table."""
 
 from __future__ import annotations
 
@@ -9,19 +6,25 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxnew import collection, loop
-from jaxnew.actions import ActionSplit, ActionUniverse
-from jaxnew.observations import RecordingFormat, Recordings
+from jaxnew import loop
+from jaxnew.actions import ActionIdentity, ActionSplit, check_same
+from jaxnew.observations import ObservationsError, Recordings
+from jaxnew.recording import (
+    ORACLE,
+    REPRESENTATION_SEED,
+    PlayRecordings,
+    collect,
+    parse_representation,
+)
 from jaxnew.representation import report
 from jaxnew.representation.learner import RepresentationLearner, RepresentationState
 from jaxnew.representation.modality import Modality
-from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
+from jaxnew.representation.sources import RecordingSource
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
@@ -30,158 +33,10 @@ from jaxnew.task.budgets import StageOneBudget
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
-from jaxnew.task.task import Drawing, Play, Task
+from jaxnew.task.task import Play, Task
 
-# One encoder is shared by all policy seeds, as in the paper; so are the recordings.
-REPRESENTATION_SEED = 31
 TABLE_FILE = "table.npz"
 SPLIT_FILE = "split.json"
-ORACLE = "-oracle"
-
-
-class Learned(NamedTuple):
-    """What the name of a learned representation says: `hvae` or `vae`, of what, and how read."""
-
-    kind: str
-    play: Play
-    modality: Modality
-
-
-def parse_representation(domain: Domain, name: str) -> Learned:
-    """What a learned representation's name, such as `hvae` or `vae-onehot`, says.
-
-    The suffix `-oracle` says that the encoder is trained on all actions, test ones included.
-
-    Raises:
-      UsageError: the name is not of that form.
-    """
-    kind, _, modality_name = name.removesuffix(ORACLE).partition("-")
-    modality_name = modality_name or next(iter(domain.play.modalities))
-    of_play = {name: play for play in domain.task.plays for name in play.modalities}
-    if kind not in ("hvae", "vae") or modality_name not in of_play:
-        legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in of_play]
-        raise UsageError(
-            f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}, each also "
-            f"with {ORACLE}; engineered: {', '.join(domain.universe.engineered)}; random-SIZE; or "
-            "an embed run, or an .npz file."
-        )
-    play = of_play[modality_name]
-    return Learned(kind, play, play.modalities[modality_name])
-
-
-@dataclass(frozen=True)
-class PlayRecordings:
-    """The recordings of every action of a domain, and how training and encoding read them.
-
-    Attributes:
-      play: how they were made.
-      recorded: what the play environment gave.
-      drawn: the same, drawn and stored; None if nothing is drawn, or on demand.
-    """
-
-    play: Play
-    recorded: Recordings
-    drawn: Recordings | None = None
-
-    def for_training(self, ids: np.ndarray) -> jax.Array | RecordingSource:
-        """The recordings of `ids`: on the device, or from a source where they are drawn."""
-        rows = self.recorded.rows(ids)
-        if self.play.drawing is None:
-            return jnp.asarray(self.recorded.data[rows])
-        return self._source(self.play.drawing, rows, self.recorded.num_recordings)
-
-    def for_encoding(
-        self, ids: np.ndarray | None = None, num_recordings: int | None = None
-    ) -> np.ndarray | RecordingSource:
-        """The first recordings of `ids`, to be read in parts; default: all of all actions."""
-        recorded = self.recorded
-        rows = np.arange(recorded.num_actions) if ids is None else recorded.rows(ids)
-        count = num_recordings or recorded.num_recordings
-        if self.play.drawing is not None:
-            return self._source(self.play.drawing, rows, count)
-        is_all = ids is None and num_recordings is None
-        return recorded.data if is_all else np.asarray(recorded.data[rows, :count])
-
-    def _source(self, drawing: Drawing, rows: np.ndarray, count: int) -> RecordingSource:
-        if self.drawn is not None:
-            return StoredRecordings(self.drawn.data[:, :count], rows)
-        data, ids = self.recorded.data[:, :count], self.recorded.ids
-        return DrawnRecordings(data, ids, drawing.draw, drawing.format.shape, rows)
-
-
-def collect(
-    domain: Domain,
-    runs: Path | str,
-    num_recordings: int,
-    play: Play | None = None,
-    stores_drawn: bool = False,
-    seed: int = REPRESENTATION_SEED,
-) -> PlayRecordings:
-    """Records every action of a domain below `runs`, from where it stands, and draws if asked to.
-
-    Args:
-      num_recordings: S, per action.
-      play: which ones; default: the task's first.
-      stores_drawn: see `StageOneBudget`; of no meaning for a play without a drawing.
-      seed: of the recordings.
-
-    Raises:
-      ObservationsError: see `jaxnew.collection.collect`.
-    """
-    play, folder = play or domain.play, domain.actions_folder(Path(runs))
-    ids = np.arange(domain.universe.num_actions, dtype=np.int32)
-    drawing = play.drawing
-    if drawing is not None:
-        print(_sizes(play.format, drawing.format, len(ids), num_recordings, stores_drawn))
-    recorded = collection.collect(
-        folder / f"{play.folder}-{num_recordings}",
-        play.record_block,
-        format=play.format,
-        universe=domain.universe,
-        ids=ids,
-        num_recordings=num_recordings,
-        seed=seed,
-        block_actions=play.block_actions,
-    )
-    if drawing is None or not stores_drawn:
-        return PlayRecordings(play, recorded)
-    drawn = _draw_all(folder, drawing, domain.universe, recorded, seed)
-    return PlayRecordings(play, recorded, drawn)
-
-
-def _draw_all(
-    folder: Path, drawing: Drawing, universe: ActionUniverse, recorded: Recordings, seed: int
-) -> Recordings:
-    """All recordings, drawn into a directory of their own."""
-    source = DrawnRecordings(recorded.data, recorded.ids, drawing.draw, drawing.format.shape)
-
-    def draw_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
-        return source.gather(recorded.rows(ids)[:, None], np.arange(num_recordings)[None])
-
-    return collection.collect(
-        folder / f"{drawing.folder}-{recorded.num_recordings}",
-        draw_block,
-        format=drawing.format,
-        universe=universe,
-        ids=recorded.ids,
-        num_recordings=recorded.num_recordings,
-        seed=seed,
-        block_actions=1,  # Of frames, 1,024 recordings are 17 MB.
-        play_settings={"drawn_from": recorded.hash},
-    )
-
-
-def _sizes(
-    small: RecordingFormat, large: RecordingFormat, num_actions: int, count: int, is_stored: bool
-) -> str:
-    """What drawing on demand and storing take."""
-    less, more = (form.estimate_bytes(num_actions, count) / 1e6 for form in (small, large))
-    now = "they are stored" if is_stored else "they are drawn on demand"
-    return (
-        f"{num_actions} actions x {count} recordings take {less:,.1f} MB where frames are drawn on "
-        f"demand (--frames=on-demand) and {less + more:,.1f} MB where they are stored "
-        f"(--frames=stored); {now}."
-    )
 
 
 @dataclass(frozen=True)
@@ -209,6 +64,7 @@ class Encoder:
 
         Raises:
           RunDirectoryError, ConfigError: `path` is no such run.
+          SplitMismatch: its table was exchanged for another.
         """
         directory = RunDirectory.load(path)
         if "model" not in directory.config:
@@ -216,6 +72,9 @@ class Encoder:
         config = from_dict(EmbedConfig, upgraded(directory.config))
         file = directory.path / TABLE_FILE
         table = RepresentationTable.load(file) if file.exists() else None
+        made = [s["table_hash"] for s in directory.provenance["sessions"] if "table_hash" in s]
+        if table is not None and made:
+            check_same("table", table.hash, made[-1], path)
         return cls(directory.path, config, task or load_task(config.task), table)
 
     @property
@@ -242,20 +101,32 @@ class Encoder:
         """Representations of recorded actions, which need not have existed before.
 
         Args:
-          recordings: [A, S, ...] as its play environment makes them.
+          recordings: [A, S, ...] as its play environment makes them, of any universe of its task.
 
         Raises:
           ObservationsError: they are of another format.
+          UsageError: training was interrupted, or the task has no such universe.
           CheckpointError: the run has no readable checkpoint.
         """
         learner, state, play = self.frozen()
-        fitting = recordings.fits(play.seen)
+        if self.table.play not in (None, play.seen.modality):
+            raise ObservationsError(
+                f"{self.path} learned from {self.table.play!r}, and what is recorded today is "
+                f"{play.seen.modality!r}. Train the encoder again."
+            )
+        universe = recordings.identity.place if recordings.identity else ""
+        plays = self.task.with_universe(universe).plays
+        alike = [each for each in plays if learner.modality.name in each.modalities]
+        fitting = recordings.fits((alike or [play])[0].seen)
         return RepresentationTable(
             vectors=learner.encode(state, fitting.data),
             ids=fitting.ids,
             universe_hash=fitting.universe_hash,
             split_hash=self.config.split_hash,
             source=f"{self.config.representation} of {self.path.name}, new recordings",
+            play=fitting.format.modality,
+            encoder_hash=self.table.made_by,
+            identity=fitting.identity,
         )
 
     def frozen(self) -> tuple[RepresentationLearner, RepresentationState, Play]:
@@ -408,6 +279,10 @@ def _train(
         universe_hash=domain.universe.hash,
         split_hash=domain.split.hash,
         source=source,
+        play=recordings.play.seen.modality,
+        identity=ActionIdentity.of(
+            domain.universe, recordings.recorded.ids, domain.task.universe_name
+        ),
     )
     table.save(directory.path / TABLE_FILE)
     directory.add_provenance(table_hash=table.hash)

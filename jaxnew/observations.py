@@ -6,10 +6,11 @@ import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jaxnew.actions import ActionUniverse, content_hash
+from jaxnew.actions import ActionIdentity, ActionUniverse, content_hash
 from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
 
 UNKNOWN_MODALITY = "unknown"
@@ -75,6 +76,7 @@ class Recordings:
       format: what one recording is.
       universe_hash: of the universe that the ids belong to, or None for actions outside of it.
       action_hashes: A hashes of the recordings of each action.
+      identity: what the actions are, None if unknown.
     """
 
     data: np.ndarray
@@ -82,6 +84,7 @@ class Recordings:
     format: RecordingFormat
     universe_hash: str | None
     action_hashes: tuple[str, ...]
+    identity: ActionIdentity | None = None
 
     @property
     def num_actions(self) -> int:
@@ -95,7 +98,7 @@ class Recordings:
     def hash(self) -> str:
         """Identifies the recordings by content, actions and modality."""
         head = f"{self.universe_hash} {self.format.modality}"
-        return content_hash(head, self.ids, *self.action_hashes)
+        return content_hash(head, np.asarray(self.ids, np.int32), *self.action_hashes)
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """int64[n] rows of `data` that hold the actions `ids`.
@@ -119,9 +122,13 @@ class Recordings:
           ObservationsError: an action was not recorded.
         """
         rows = self.rows(ids)
-        hashes = tuple(self.action_hashes[row] for row in rows)
-        data = np.asarray(self.data[rows])
-        return Recordings(data, self.ids[rows], self.format, self.universe_hash, hashes)
+        return replace(
+            self,
+            data=np.asarray(self.data[rows]),
+            ids=self.ids[rows],
+            action_hashes=tuple(self.action_hashes[row] for row in rows),
+            identity=self.identity and self.identity.rows(rows),
+        )
 
     def fits(self, format: RecordingFormat) -> Recordings:
         """These recordings as ones of `format`, which an encoder reads.
@@ -141,27 +148,32 @@ class Recordings:
         return replace(self, format=format)
 
     def save(self, path: Path | str) -> None:
-        """Writes one small file with the arrays `ids`, `recordings` and `modality`."""
+        """Writes one file: `ids`, `recordings`, `modality`, and what the actions are."""
+        texts = {
+            "modality": self.format.modality,
+            "universe_hash": self.universe_hash,
+            "hash": self.hash,
+        }
+        arrays: dict[str, Any] = {"ids": self.ids, "recordings": self.data}
+        arrays |= {name: np.array(text) for name, text in texts.items() if text is not None}
+        arrays |= self.identity.arrays() if self.identity else {}
         buffer = io.BytesIO()
-        np.savez_compressed(
-            buffer,
-            ids=self.ids,
-            recordings=self.data,
-            modality=np.array(self.format.modality),
-        )
+        np.savez_compressed(buffer, **arrays)
         write_bytes_atomically(Path(path), buffer.getvalue())
 
     @classmethod
     def load(cls, path: Path | str) -> Recordings:
-        """Reads recordings of new actions, which need not exist in any universe.
+        """Reads what `save` wrote, or recordings of a user's own.
 
         Args:
-          path: a file with `ids` int[A] (names of the new actions, each once), `recordings`
+          path: a file with `ids` int[A] (numbers of the actions, each once), `recordings`
             [A, S, ...] with S >= 1 and, optionally, the string `modality`. An encoder checks that
-            it was trained on such recordings, see `fits`.
+            it was trained on such recordings, see `fits`. Without the rest of what `save` writes,
+            nobody can tell what the actions are, and `Run.evaluate` has to be told to trust them.
 
         Raises:
-          ObservationsError: the file is missing or damaged, or its arrays do not belong together.
+          ObservationsError: the file is missing, damaged or was edited, or its arrays do not belong
+            together.
         """
         arrays = _read_npz(Path(path))
         ids, data = checked_ids(arrays["ids"], None, str(path)), arrays["recordings"]
@@ -174,7 +186,20 @@ class Recordings:
             raise ObservationsError(f"{path}: the array `recordings` has dtype {data.dtype}.")
         modality = str(arrays.get("modality", UNKNOWN_MODALITY))
         format = RecordingFormat(modality, data.shape[2:], data.dtype.name)
-        return cls(data, ids, format, None, tuple(row_hash(rows) for rows in data))
+        found = cls(
+            data,
+            ids,
+            format,
+            str(arrays["universe_hash"]) if "universe_hash" in arrays else None,
+            tuple(row_hash(rows) for rows in data),
+            ActionIdentity.from_arrays(arrays),
+        )
+        if str(arrays.get("hash", found.hash)) != found.hash:
+            raise ObservationsError(
+                f"{path} was edited: its ids and recordings hash to {found.hash}, it says "
+                f"{arrays['hash']}. Restore the file, or record the actions again."
+            )
+        return found
 
 
 def checked_ids(ids: np.ndarray, universe: ActionUniverse | None, where: str) -> np.ndarray:

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, cast
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxnew.actions import ActionSplit, mixture_ids
+from jaxnew.actions import ActionSplit, check_same, mixture_ids
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.evaluation import EVALUATION_SEED, measure, play, summarize
+from jaxnew.new_actions import offer
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.contract import Episode, Policy
 from jaxnew.sampling import Actions
@@ -97,6 +97,11 @@ class Evaluation:
                 for metric, value in row["metrics"].items()
             )
             lines.append(f"{name:>12} ({row['num_episodes']} episodes, {row['policy']}): {metrics}")
+            if "num_seen" in row:
+                lines.append(
+                    f"{'':>12} {row['num_actions']} actions of {row['universe']}, "
+                    f"{row['num_seen']} seen in training, e.g. {'; '.join(row['examples'])}"
+                )
         return "\n".join(lines)
 
 
@@ -182,6 +187,8 @@ class Run:
         ids: Mapping[str, np.ndarray] | None = None,
         table: RepresentationTable | None = None,
         table_name: str = "",
+        universe: str = "",
+        allow: Collection[str] = (),
         unseen_ratio: float | None = None,
         episodes: int = 5000,
         set_size: int | None = None,
@@ -197,8 +204,10 @@ class Run:
           parts: of the split, one or several of `train`, `validation`, `test`, `all`; default:
             `test`, where nothing else says what to draw from.
           ids: by name, int32[n] actions to draw sets from.
-          table: representations of actions, which are drawn from, in place of the run's own.
+          table: representations of actions, which are drawn from. They need not have existed at
+            training, and are found by what they do, not by their numbers.
           table_name: what its results are called; default: the beginning of its hash.
+          universe, allow: of the table's actions, see `jaxnew.new_actions.offer`.
           unseen_ratio: draw from a mixture of train and test actions with such a share of the
             latter.
           episodes: per list of actions.
@@ -209,29 +218,47 @@ class Run:
           record: keep the results in the run directory, `evaluation/*.json`.
 
         Raises:
-          UsageError: several of `parts`, `ids`, `table`, `unseen_ratio` are given, or the table has
-            another width or actions that the environment does not have.
+          UsageError: several of `parts`, `ids`, `table`, `unseen_ratio` are given, or see `offer`.
+          SplitMismatch: the table is none for this run, see `offer`.
           ValueError: there are no such sets.
         """
         check_seed(seed, "seed of the evaluation")
-        own = self.trainer.training.table
-        vectors = own if table is None else with_rows(own, table)
-        if table is not None:
-            table_name = f"table-{table_name or table.hash[:8]}"
-        of_table = None if table is None else {table_name: table.ids}
         named = (parts,) if isinstance(parts, str) else tuple(parts)
-        lists = self._lists(named, ids, of_table, unseen_ratio)
+        if sum((bool(named), ids is not None, table is not None, unseen_ratio is not None)) > 1:
+            raise UsageError(
+                "Give one of parts of the split, ids, table, unseen_ratio; each of them says where "
+                "sets come from."
+            )
+        if table is None and (universe or allow):
+            raise UsageError("universe and allow are about the actions of a table; give one.")
+        asked = (episodes, seed, greedy)
         rows: dict[str, dict[str, Any]] = {}
-        for name, chosen in lists.items():
-            actions = self.trainer.actions(name, chosen, set_size, vectors)
-            rows[name] = self._row(actions.growing(grows_from, growth), episodes, seed, greedy)
+
+        def play_with(trainer: Trainer, name: str, actions: Actions, **more: Any) -> None:
+            row = self._row(trainer, actions.growing(grows_from, growth), *asked)
+            rows[name] = {**row, **more}
             if record:
                 self.record(name, rows[name])
+
+        if table is not None:
+            name = f"table-{table_name or table.hash[:8]}"
+            new = offer(self.trainer, table, universe, allow)
+            try:
+                actions = new.trainer.actions(name, new.ids, set_size, new.vectors)
+                play_with(new.trainer, name, actions, **new.describe())
+            finally:
+                if new.trainer is not self.trainer:
+                    new.trainer.close()
+        else:
+            for name, chosen in self._lists(named, ids, unseen_ratio).items():
+                play_with(self.trainer, name, self.trainer.actions(name, chosen, set_size))
         return Evaluation(f"{self.path}, {self.checkpoint} checkpoint (update {self.step})", rows)
 
-    def _row(self, actions: Actions, episodes: int, seed: int, greedy: bool) -> dict[str, Any]:
+    def _row(
+        self, trainer: Trainer, actions: Actions, episodes: int, seed: int, greedy: bool
+    ) -> dict[str, Any]:
         start = time.perf_counter()
-        played = measure(self.trainer.rollout, self.policy, actions, episodes, seed, greedy)
+        played = measure(trainer.rollout, self.policy, actions, episodes, seed, greedy)
         growth = {"first_size": actions.first_size, "growth": actions.growth}
         return {
             "metrics": summarize(played),
@@ -248,18 +275,11 @@ class Run:
         self,
         parts: tuple[str, ...],
         ids: Mapping[str, np.ndarray] | None,
-        of_table: Mapping[str, np.ndarray] | None,
         unseen_ratio: float | None,
     ) -> dict[str, np.ndarray | None]:
         """By name, the actions to draw from; None for a part of the split."""
-        given = [bool(parts), ids is not None, of_table is not None, unseen_ratio is not None]
-        if sum(given) > 1:
-            raise UsageError(
-                "Give one of parts of the split, ids, table, unseen_ratio; each of them says where "
-                "sets come from."
-            )
-        if ids is not None or of_table is not None:
-            return dict(ids or of_table or {})
+        if ids is not None:
+            return dict(ids)
         if unseen_ratio is not None:
             mixed = mixture_ids(self.split.train, self.split.test, unseen_ratio)
             return {f"unseen-{unseen_ratio:g}": mixed}
@@ -323,24 +343,12 @@ def load_trainer(
     config = only_computed(config, assignments)
     split = ActionSplit.load(directory.path / SPLIT_FILE)
     table = RepresentationTable.load(directory.path / TABLE_FILE)
-    split.check(task.make_universe())
-    table.check(task.make_universe(), split)
+    known = task.make_universe().first(len(table.ids))  # It may have grown since.
+    split.check(known)
+    table.check(known, split)
+    check_same("split", split.hash, config.split_hash, directory.path)
+    check_same("table", table.hash, config.table_hash, directory.path)
     return Trainer.of(config, task, split, table, num_workers)
-
-
-def with_rows(vectors: Any, new: RepresentationTable) -> Any:
-    """f32[A, d] representations with the rows of `new` in place of their own.
-
-    Raises:
-      UsageError: the new rows have another width, or ids that the environment does not have.
-    """
-    if new.vectors.shape[1] != vectors.shape[1] or new.ids.max() >= vectors.shape[0]:
-        raise UsageError(
-            f"The new table has {new.vectors.shape[1]} numbers per action and ids up to "
-            f"{new.ids.max()}; the policy reads {vectors.shape[1]} numbers, and the environment "
-            f"has ids 0..{vectors.shape[0] - 1}."
-        )
-    return vectors.at[jnp.asarray(new.ids)].set(jnp.asarray(new.vectors))
 
 
 def file_stem(content: Mapping[str, Any]) -> str:

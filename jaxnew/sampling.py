@@ -193,6 +193,11 @@ class Actions:
           ValueError: there are no such sets.
         """
         table = jnp.asarray(table)
+        if np.size(ids) and np.max(ids) >= len(table):
+            raise ValueError(
+                f"{name} hold action {np.max(ids)}, and the table describes 0..{len(table) - 1}. "
+                "Encode that action, and give its table."
+            )
         if set_size is None:
             if padded_size or groups is not None:
                 raise ValueError("A fixed set has neither padding nor groups; give a set_size.")

@@ -48,6 +48,7 @@ class Trainer:
     learner: Learner
     training: Actions
     watched: Mapping[str, Actions]
+    num_workers: int = 0
 
     @classmethod
     def of(
@@ -58,7 +59,7 @@ class Trainer:
         table: RepresentationTable,
         num_workers: int = 0,
     ) -> Trainer:
-        """Builds the parts; `num_workers` processes for environments on the host, 0: one per core.
+        """Builds the parts.
 
         Raises:
           ValueError: unknown method, or sets larger than the train or validation pool.
@@ -73,7 +74,7 @@ class Trainer:
             conditions_position=config.conditions_position,
         )
         rollout = rollout_of(task, method, config.ppo, config.seed, num_workers)
-        vectors = jax.numpy.asarray(table.rows(np.arange(task.action_spec.num_actions)))
+        vectors = jax.numpy.asarray(table.rows(np.arange(len(table.ids))))
         always = split.always_available
         sets = config.sets
         if sets.is_fixed:
@@ -110,7 +111,7 @@ class Trainer:
                 name=f"the {part} actions",
             )
         learner = Learner(rollout, config.ppo)
-        return cls(config, task, split, table, learner, training, watched)
+        return cls(config, task, split, table, learner, training, watched, num_workers)
 
     @property
     def rollout(self) -> Rollout:

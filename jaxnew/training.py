@@ -10,6 +10,7 @@ from typing import Any
 import jax
 
 from jaxnew import loop
+from jaxnew.actions import ActionSplit, check_same
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
@@ -194,9 +195,13 @@ def open_run(path: Path, trainer: Trainer, overwrite: bool = False) -> RunDirect
         {"split_hash": split.hash, "table_hash": table.hash, "table": table.source},
         upgrade=upgraded,
     )
-    if not (directory.path / TABLE_FILE).exists():
-        split.save(directory.path / SPLIT_FILE)
-        table.save(directory.path / TABLE_FILE)
+    split_file, table_file = directory.path / SPLIT_FILE, directory.path / TABLE_FILE
+    if table_file.exists():
+        check_same("split", ActionSplit.load(split_file).hash, split.hash, path)
+        check_same("table", RepresentationTable.load(table_file).hash, table.hash, path)
+    else:
+        split.save(split_file)
+        table.save(table_file)
     return directory
 
 

@@ -27,13 +27,15 @@ LAYERS = (
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
-    {"embedding", "trainer", "run", "training", "sweeping"},
+    {"recording", "embedding", "trainer", "new_actions", "run", "training", "sweeping"},
 )
 SIDEWAYS = {
     "observations": {"actions", "storage"},
     "collection": {"actions", "observations", "storage"},
     "ppo": {"rollout"},
-    "run": {"embedding", "trainer"},
+    "embedding": {"recording"},
+    "new_actions": {"trainer"},
+    "run": {"embedding", "new_actions", "trainer"},
     "training": {"embedding", "run", "trainer"},
     "sweeping": {"run", "trainer", "training"},
 }

@@ -12,9 +12,9 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 
+from jaxnew.recording import record
 from jaxnew.task.domain import Domain, load_task
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -29,19 +29,13 @@ def blocks(page: Path, language: str = "python") -> list[str]:
     return re.findall(rf"^```{language}\n(.+?)^```$", page.read_text(), re.DOTALL | re.MULTILINE)
 
 
-def write_new_recordings(path: Path) -> None:
-    """Recordings of 60 skills, as somebody would bring them."""
-    domain = Domain.of(load_task("grid_world"))
-    ids = domain.split.test[:60]
-    np.savez(path, ids=ids, recordings=domain.play.record_block(5, ids, 8))
-
-
 @pytest.mark.integration
 def test_the_code_of_the_readme_is_a_script(tmp_path: Path) -> None:
     """In a folder of its own and at smoke budget; no flag is parsed, no command is called."""
     learns, returns = blocks(README)
     assert README.read_text().partition("```")[2].startswith("python\nimport jaxnew\n")
-    write_new_recordings(tmp_path / "new.npz")
+    test = Domain.of(load_task("grid_world")).split.test
+    record("grid_world", test[:60], output=tmp_path / "new.npz", budget="smoke")
     smaller = {
         "laptop": "smoke",
         "episodes=5000": "episodes=64",

@@ -1,12 +1,16 @@
 """The ladder of `tests/probe_environments.py` as a task inside jit, small enough for tests.
 
 `--task=tests.toy_device:TASK`. Its actions are recorded, so that encoders can be trained, and its
-environment has settings.
+environment has settings. Its universes are cut from a list without end: action `n` of it climbs
+`1 + n % 4` rungs and is worth what action `n % 24` is.
 """
 
 from __future__ import annotations
 
+import re
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -18,6 +22,7 @@ from jaxnew.representation.modality import vector_modality
 from jaxnew.rollout.contract import RolloutConfig
 from jaxnew.sampling import SetConfig
 from jaxnew.task.budgets import LoopConfig, StageOneBudget, StageTwoBudget
+from jaxnew.task.places import UsageError
 from jaxnew.task.presentation import Presentation
 from jaxnew.task.task import Play, Task
 from tests import probe_environments as probe
@@ -47,19 +52,31 @@ class LadderSettings:
 class Ladder(probe.TableWorld):
     """A ladder that is climbed 1 to 4 rungs a step, with settings."""
 
-    def __init__(self, time_limit: int, reward_scale: float, is_inverted: bool) -> None:
-        super().__init__(A)
+    def __init__(
+        self,
+        time_limit: int,
+        reward_scale: float,
+        is_inverted: bool,
+        numbers: Sequence[int] = range(A),
+    ) -> None:
+        super().__init__(len(numbers))
         ladder = probe.ladder(A, time_limit=time_limit)
         scale = -reward_scale if is_inverted else reward_scale
-        self._ladder = replace(ladder, reward=scale * ladder.reward)
+        columns = np.asarray(numbers) % A
+        self._ladder = replace(
+            ladder,
+            next_state=ladder.next_state[:, columns],
+            reward=scale * ladder.reward[:, columns],
+            terminates=ladder.terminates[:, columns],
+        )
 
     @property
     def default_params(self) -> probe.TableParams:
         return self._ladder
 
 
-def universe() -> ActionUniverse:
-    ids = np.arange(A)
+def universe(numbers: Sequence[int] = range(A)) -> ActionUniverse:
+    ids = np.asarray(numbers)
     vectors = np.column_stack([ids % 4 - 1.5, np.cos(ids), np.sin(3 * ids)]).astype(np.float32)
     return ActionUniverse(
         name="Ladder-v0",
@@ -72,8 +89,11 @@ def universe() -> ActionUniverse:
     )
 
 
-def record(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
+def record(
+    seed: int, ids: np.ndarray, num_recordings: int, numbers: Sequence[int] = range(A)
+) -> np.ndarray:
     """f32[n, S, 3, 2] a way that goes up by what the action climbs, from somewhere."""
+    ids = np.asarray(numbers)[ids]
     rises = np.arange(NUM_FRAMES)[:, None] * np.array([1.0, 0.5])
     shape = (num_recordings, 1, 1)
     ways = [action_rng(seed, int(i)).normal(size=shape) + rises * (i % 4 + 1) for i in ids]
@@ -124,6 +144,21 @@ def _targets(universe: ActionUniverse) -> dict[str, np.ndarray]:
     return {"rungs": universe.class_labels[:, None] + 1.0}
 
 
+def with_numbers(name: str) -> Task:
+    """`FIRST-COUNT`: the task with so many actions of the list, from the first on."""
+    if not re.fullmatch(r"\d+-\d+", name):
+        raise UsageError(f"A ladder has no universe {name!r}; give FIRST-COUNT.")
+    first, count = map(int, name.split("-"))
+    numbers = range(first, first + count)
+    return replace(
+        TASK,
+        make_universe=partial(universe, numbers),
+        make_environment=partial(Ladder, numbers=numbers),
+        plays=(replace(PLAY, record_block=partial(record, numbers=numbers)),),
+        universe_name=name,
+    )
+
+
 TASK = Task(
     name="toy-ladder",
     make_universe=universe,
@@ -134,6 +169,8 @@ TASK = Task(
     stage_one={"smoke": _STAGE_ONE},
     stage_two={"smoke": _SMOKE},
     evaluation_width=8,
+    universe_name=f"0-{A}",
+    other_universes=with_numbers,
     shown=Presentation(representation_targets=_targets),
     place="tests.toy_device:TASK",
 )

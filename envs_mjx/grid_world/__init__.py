@@ -6,6 +6,13 @@ from envs_mjx.grid_world.environment import (
     GridWorldSettings,
     GridWorldState,
 )
-from envs_mjx.grid_world.skills import skill_universe
+from envs_mjx.grid_world.skills import load_skills, skill_universe
 
-__all__ = ["GridWorld", "GridWorldParams", "GridWorldSettings", "GridWorldState", "skill_universe"]
+__all__ = [
+    "GridWorld",
+    "GridWorldParams",
+    "GridWorldSettings",
+    "GridWorldState",
+    "load_skills",
+    "skill_universe",
+]

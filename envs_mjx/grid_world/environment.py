@@ -12,7 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from envs_mjx.grid_world.skills import NUM_MOVES, NUM_SKILLS, direction_of, moves_of
+from envs_mjx.grid_world.skills import (
+    NUM_MOVES,
+    NUM_SKILLS,
+    direction_of,
+    moves_of,
+    skill_moves,
+)
 from jaxnew.environment import (
     Action,
     ActionSpec,
@@ -141,9 +147,10 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
     Observation: f32[81], the object id of cell (x, y) in element `9 * x + y`, each in 1..11: 1
       empty, 2 wall, 8 goal, 9 lava, 10 agent (hides what is below it), 11 opening (sub-goal). The
       32 wall elements never change. The goal's element changes in `final_observation` only.
-    Action: `Action.id` int32[] in 0..1023, five moves (`skills.moves_of`); moves after the end of
-      the episode are not executed. Any other id is invalid: it takes five moves without effect and
-      sets `info["invalid_action"]`. Position (k = 0) and stop bit are ignored.
+    Action: `Action.id` int32[] in 0..1023 (and those of `extra`), five moves (`skills.moves_of`);
+      moves after the end of the episode are not executed. Any other id is invalid: it takes five
+      moves without effect and sets `info["invalid_action"]`. Position (k = 0) and stop bit are
+      ignored.
     Reward: f32[], the sum over executed moves: 0.1 on the first visit to the opening,
       `1 - 0.9 * num_moves / 50` at the goal, else 0; in [0, 0.884] per step and per
       episode.
@@ -172,12 +179,19 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
         goal_reward: float = GridWorldSettings.goal_reward,
         time_penalty: float = GridWorldSettings.time_penalty,
         fixed_layout: int = GridWorldSettings.fixed_layout,
+        extra: tuple[str, ...] = (),
     ) -> None:
         """Takes the fields of `GridWorldSettings`, which become `default_params`.
+
+        Args:
+          max_moves, subgoal_reward, goal_reward, time_penalty, fixed_layout: see
+            `GridWorldSettings`.
+          extra: skills with the ids 1024.., see `skills.load_skills`.
 
         Raises:
           ValueError: a number is out of its range.
         """
+        self._extra = extra
         self._settings = GridWorldSettings(
             max_moves, subgoal_reward, goal_reward, time_penalty, fixed_layout
         )
@@ -189,8 +203,8 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
 
     @property
     def action_spec(self) -> ActionSpec:
-        """1024 skills, no position, no stop bit."""
-        return ActionSpec(num_actions=NUM_SKILLS)
+        """1024 skills and the extra ones, no position, no stop bit."""
+        return ActionSpec(num_actions=NUM_SKILLS + len(self._extra))
 
     def observation_spec(self, params: GridWorldParams) -> ObservationSpec:
         """f32[81] in 1..11; the ring of walls is constant."""
@@ -227,7 +241,7 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
           (obs f32[81], state, reward f32[], terminated bool[], truncated bool[], info).
         """
         del key
-        state, reward, terminated, truncated, info = _transition(state, action, params)
+        state, reward, terminated, truncated, info = _transition(state, action, params, self._extra)
         return _observe(state), state, reward, terminated, truncated, info
 
     def step(
@@ -237,7 +251,7 @@ class GridWorld(Environment[GridWorldState, GridWorldParams]):
 
         Consumes `key` for the next episode's layout.
         """
-        state, reward, terminated, truncated, info = _transition(state, action, params)
+        state, reward, terminated, truncated, info = _transition(state, action, params, self._extra)
         first_state = _first_state(key, params)
         done = terminated | truncated
         next_state = jax.tree.map(lambda new, old: jnp.where(done, new, old), first_state, state)
@@ -285,13 +299,14 @@ def _observe(state: GridWorldState) -> jax.Array:
 
 
 def _transition(
-    state: GridWorldState, action: Action, params: GridWorldParams
+    state: GridWorldState, action: Action, params: GridWorldParams, extra: tuple[str, ...]
 ) -> tuple[GridWorldState, jax.Array, jax.Array, jax.Array, Info]:
     """One skill, move by move: (state, reward, terminated, truncated, info)."""
     chex.assert_shape(state.agent_xy, (2,))
     chex.assert_rank(action.id, 0)
-    is_valid = (action.id >= 0) & (action.id < NUM_SKILLS)
-    dxs, dys = direction_of(moves_of(action.id))
+    is_valid = (action.id >= 0) & (action.id < NUM_SKILLS + len(extra))
+    moves = jnp.asarray(skill_moves(extra))[action.id] if extra else moves_of(action.id)
+    dxs, dys = direction_of(moves)
     max_moves = jnp.asarray(params.max_moves, jnp.int32)
     is_horizontal, position, opening = decode_layout(state.layout)
 

@@ -10,15 +10,19 @@ from functools import partial
 import jax
 import jax.numpy as jnp
 
-from envs_mjx.grid_world.skills import NUM_MOVES, direction_of, moves_of
+from envs_mjx.grid_world.skills import NUM_MOVES, direction_of, moves_of, skill_moves
 
 PLAY_SIZE = 80
 NUM_POSITIONS = NUM_MOVES + 1
 
 
-@partial(jax.jit, static_argnames=("num_recordings", "has_border"))
+@partial(jax.jit, static_argnames=("num_recordings", "has_border", "extra"))
 def record(
-    key: jax.Array, skill_ids: jax.Array, num_recordings: int, has_border: bool = True
+    key: jax.Array,
+    skill_ids: jax.Array,
+    num_recordings: int,
+    has_border: bool = True,
+    extra: tuple[str, ...] = (),
 ) -> jax.Array:
     """Plays every skill from random cells of the 80 x 80 room.
 
@@ -33,17 +37,18 @@ def record(
       skill_ids: int32[n] ids in 0..1023; ids outside are not refused, see `skills.moves_of`.
       num_recordings: S, trajectories per skill.
       has_border: whether walls surround the room (the release) or not (the paper's prose).
+      extra: skills with the ids 1024.., see `skills.load_skills`.
 
     Returns:
       uint8[n, S, 6, 2] cells (x, y) before the first and after each of the five moves.
     """
-    return jax.vmap(partial(_record_skill, key, num_recordings, has_border))(
-        jnp.asarray(skill_ids, jnp.int32)
-    )
+    ids = jnp.asarray(skill_ids, jnp.int32)
+    moves = jnp.asarray(skill_moves(extra))[ids] if extra else moves_of(ids)
+    return jax.vmap(partial(_record_skill, key, num_recordings, has_border))(ids, moves)
 
 
 def _record_skill(
-    key: jax.Array, num_recordings: int, has_border: bool, skill_id: jax.Array
+    key: jax.Array, num_recordings: int, has_border: bool, skill_id: jax.Array, moves: jax.Array
 ) -> jax.Array:
     """uint8[S, 6, 2] trajectories of one skill."""
     margin = 1 if has_border else NUM_MOVES
@@ -52,7 +57,7 @@ def _record_skill(
     num_starts = width * width - int(has_border)
     cell = jax.random.randint(jax.random.fold_in(key, skill_id), (num_recordings,), 0, num_starts)
     start_xy = margin + jnp.stack([cell // width, cell % width], axis=-1)
-    return trajectory(start_xy, skill_id, has_border).astype(jnp.uint8)
+    return _walk(start_xy, moves, has_border).astype(jnp.uint8)
 
 
 def trajectory(start_xy: jax.Array, skill_id: jax.Array, has_border: bool = True) -> jax.Array:
@@ -67,8 +72,13 @@ def trajectory(start_xy: jax.Array, skill_id: jax.Array, has_border: bool = True
     Returns:
       int32[..., 6, 2] the start and the cell after each move.
     """
+    return _walk(start_xy, moves_of(jnp.asarray(skill_id)), has_border)
+
+
+def _walk(start_xy: jax.Array, moves: jax.Array, has_border: bool) -> jax.Array:
+    """`trajectory` of moves int32[5]."""
     low, high = (1, PLAY_SIZE - 2) if has_border else (0, PLAY_SIZE - 1)
-    steps = jnp.stack(direction_of(moves_of(jnp.asarray(skill_id))), axis=-1)
+    steps = jnp.stack(direction_of(moves), axis=-1)
     positions = [jnp.asarray(start_xy, jnp.int32)]
     for t in range(NUM_MOVES):
         positions.append(jnp.clip(positions[-1] + steps[t], low, high))

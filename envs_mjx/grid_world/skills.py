@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from functools import lru_cache
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -13,6 +14,7 @@ from jaxnew.actions import ActionUniverse
 NUM_MOVES = 5
 NUM_SKILLS = 4**NUM_MOVES
 MOVE_NAMES = "RDLU"
+STAY = "."  # A move of a user's own skills only.
 
 Array = TypeVar("Array", np.ndarray, jax.Array)
 
@@ -39,7 +41,7 @@ def direction_of(moves: Array) -> tuple[Array, Array]:
     """The displacement of single moves, by arithmetic instead of a table look-up.
 
     Args:
-      moves: integer[...] move ids in 0..3, NumPy or JAX.
+      moves: integer[...] move ids in 0..3, NumPy or JAX; any other is to stay.
 
     Returns:
       (dx, dy), each int32[...] in {-1, 0, 1} cells; x grows to the right, y grows downwards.
@@ -63,21 +65,51 @@ def skill_name(skill_id: int) -> str:
     return "".join(MOVE_NAMES[move] for move in moves_of(np.asarray(skill_id)))
 
 
-def net_displacement() -> np.ndarray:
-    """int32[1024, 2] (dx, dy) in cells that each skill travels where no wall is near.
+def load_skills(path: Path | str) -> tuple[str, ...]:
+    """Skills of a user's own: a text file with five letters of R, D, L, U and `.` (stay) per line.
 
-    36 distinct values, |dx| + |dy| odd and at most 5.
+    Raises:
+      ValueError: the file holds something else, a skill twice, or none.
     """
-    return move_displacements().reshape(NUM_SKILLS, NUM_MOVES, 2).sum(axis=1, dtype=np.int32)
+    names = tuple(Path(path).read_text().split())
+    for number, name in enumerate(names):
+        wrong = len(name) != NUM_MOVES or set(name) - set(MOVE_NAMES + STAY)
+        if wrong or name in names[:number]:
+            raise ValueError(
+                f"{path}: {name!r} is not a skill, or stands there twice; a skill is {NUM_MOVES} "
+                f"letters of {', '.join(MOVE_NAMES)} and {STAY!r}, such as 'RR.DD', once."
+            )
+    if not names:
+        raise ValueError(f"{path} holds no skill.")
+    return names
 
 
-def move_displacements() -> np.ndarray:
-    """int32[1024, 10] the per-move coordinates (dx_1, dy_1, ..., dx_5, dy_5) in cells.
+@lru_cache(maxsize=8)
+def skill_moves(extra: tuple[str, ...] = ()) -> np.ndarray:
+    """int32[1024 + n, 5] moves of every skill and then of `extra` ones; 4 is to stay."""
+    own = [[(MOVE_NAMES + STAY).index(letter) for letter in name] for name in extra]
+    moves = np.concatenate(
+        [moves_of(np.arange(NUM_SKILLS)), np.array(own, np.int32).reshape(-1, NUM_MOVES)]
+    )
+    moves.setflags(write=False)
+    return moves
+
+
+def net_displacement(extra: tuple[str, ...] = ()) -> np.ndarray:
+    """int32[1024 + n, 2] (dx, dy) in cells that each skill travels where no wall is near.
+
+    36 distinct values, |dx| + |dy| odd and at most 5; more with `extra` skills.
+    """
+    return move_displacements(extra).reshape(-1, NUM_MOVES, 2).sum(axis=1, dtype=np.int32)
+
+
+def move_displacements(extra: tuple[str, ...] = ()) -> np.ndarray:
+    """int32[1024 + n, 10] the per-move coordinates (dx_1, dy_1, ..., dx_5, dy_5) in cells.
 
     A linear map explains 0.40 of them (R2) from the vectors of the released HVAE.
     """
-    directions = direction_of(moves_of(np.arange(NUM_SKILLS)))
-    return np.stack(directions, axis=-1).reshape(NUM_SKILLS, 2 * NUM_MOVES)
+    directions = direction_of(skill_moves(extra))
+    return np.stack(directions, axis=-1).reshape(-1, 2 * NUM_MOVES)
 
 
 def quadrant_of(displacement: np.ndarray) -> np.ndarray:
@@ -99,29 +131,30 @@ def quadrant_of(displacement: np.ndarray) -> np.ndarray:
     return np.select(conditions, [0, 1, 2], default=3).astype(np.int32)
 
 
-@lru_cache(maxsize=1)
-def skill_universe() -> ActionUniverse:
-    """All skills as an action universe.
+@lru_cache(maxsize=8)
+def skill_universe(extra: tuple[str, ...] = ()) -> ActionUniverse:
+    """All skills as an action universe, and behind them `extra` ones, see `load_skills`.
 
-    Classes are quadrants of the net displacement (256 skills each); the primary parameter is the
-    direction of the net displacement in degrees, 0 = east, clockwise on the screen, in [0, 360).
-    The content is the move sequence, uint8[1024, 5]. Engineered vectors:
+    Classes are quadrants of the net displacement (256 skills each; extra ones that end where they
+    began count as north-east); the primary parameter is the direction of the net displacement in
+    degrees, 0 = east, clockwise on the screen, in [0, 360). The content is the move sequence,
+    uint8[A, 5]. Engineered vectors:
 
-    * `gt12` f32[1024, 12]: net displacement, then the five moves, all with the mirrored signs of
+    * `gt12` f32[A, 12]: net displacement, then the five moves, all with the mirrored signs of
       the release (right is (-1, 0), down is (0, -1));
-    * `gt5` f32[1024, 5]: the five move ids 0..3 as -1.5, -0.5, 0.5, 1.5.
+    * `gt5` f32[A, 5]: the five move ids 0..4 as -1.5, -0.5, 0.5, 1.5, 2.5.
     """
-    moves = moves_of(np.arange(NUM_SKILLS))
-    displacement = net_displacement()
+    moves = skill_moves(extra)
+    displacement = net_displacement(extra)
     angle_deg = np.degrees(np.arctan2(displacement[:, 1], displacement[:, 0])) % 360.0
     # Negated as integers, so that no -0.0 appears.
-    gt12 = -np.concatenate([displacement, move_displacements()], axis=1)
+    gt12 = -np.concatenate([displacement, move_displacements(extra)], axis=1)
     return ActionUniverse(
         name="GridWorld-v0",
         class_labels=quadrant_of(displacement),
         class_names=QUADRANT_NAMES,
         primary_parameter=angle_deg.astype(np.float64),
-        action_names=tuple(skill_name(skill_id) for skill_id in range(NUM_SKILLS)),
+        action_names=(*(skill_name(skill_id) for skill_id in range(NUM_SKILLS)), *extra),
         content=moves.astype(np.uint8),
         engineered={
             "gt12": gt12.astype(np.float32),

@@ -15,7 +15,7 @@ from experiments.reports.paper import PaperCurve, paper_curve, paper_method
 from experiments.reports.plots import Bar, BarSetting, Color, Scatter
 from experiments.reports.results import ResultRow
 from experiments.reports.runs import Group, RunRecord
-from jaxnew.embedding import REPRESENTATION_SEED
+from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.representation import report
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.domain import Domain, load_task

@@ -20,7 +20,8 @@ from experiments.reports.plots import amount
 from experiments.reports.production import Cell, Source
 from experiments.reports.runs import read_runs
 from jaxnew.cores import available_cores
-from jaxnew.embedding import TABLE_FILE, parse_representation
+from jaxnew.embedding import TABLE_FILE
+from jaxnew.recording import parse_representation
 from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.methods import file_name
 from jaxnew.task.places import UsageError

@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from experiments.reports.runs import RunRecord, read_runs
-from jaxnew.embedding import REPRESENTATION_SEED, TABLE_FILE
+from jaxnew.embedding import TABLE_FILE
+from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.run_directory import RunDirectoryError

@@ -15,7 +15,8 @@ from experiments.reports.paper import PaperValue, paper_method, paper_results
 from experiments.reports.runs import Group, RunRecord, group_runs, policies
 from experiments.reports.study_report import Study, StudyPoint
 from jaxnew.actions import ActionSplit
-from jaxnew.embedding import Encoder, collect
+from jaxnew.embedding import Encoder
+from jaxnew.recording import collect
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Question, Run
 from jaxnew.task.places import UsageError

@@ -41,6 +41,7 @@ from jaxnew.representation.modality import Modality
 from jaxnew.rollout.contract import Episode, RolloutConfig
 from jaxnew.task.budgets import Baselines, LoopConfig, StageOneBudget, StageTwoBudget
 from jaxnew.task.domain import published
+from jaxnew.task.places import UsageError
 from jaxnew.task.presentation import ActionStudy, Film, Filming, Measured, Presentation
 from jaxnew.task.task import HostDomain, Play, Task
 
@@ -163,6 +164,7 @@ def _play(spacing_deg: int) -> Play:
 
 
 _SPACINGS = (DEFAULT_SPACING_DEG, ANALYSIS_SPACING_DEG)
+_UNIVERSES = tuple(f"{spacing}-degrees" for spacing in _SPACINGS)
 _PLAYS = {spacing: (_play(spacing), video_play(spacing)) for spacing in _SPACINGS}
 
 
@@ -282,8 +284,20 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             studies=studies if is_analysis else {},
             filming=Filming(partial(_draw, *place)),
         ),
+        universe_name=_UNIVERSES[is_analysis],
+        other_universes=partial(_with_tools, level, with_subgoals),
         actions_name="create-analysis" if is_analysis else "create",
     )
+
+
+def _with_tools(level: str, with_subgoals: bool, name: str) -> Task:
+    """The level with the tools of the other list."""
+    if name not in _UNIVERSES:
+        raise UsageError(
+            f"CREATE has no tools {name!r}; it has those of {' and '.join(_UNIVERSES)}."
+        )
+    is_analysis = name == _UNIVERSES[True]
+    return create_task(level, with_subgoals=with_subgoals, is_analysis=is_analysis)
 
 
 _SPLITS = {name: published(partial(published_split, name)) for name in ("default", "full")}

@@ -3,24 +3,51 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from envs_mjx.grid_world import GridWorld, GridWorldSettings, drawing, play, skill_universe, skills
+from envs_mjx.grid_world import (
+    GridWorld,
+    GridWorldSettings,
+    drawing,
+    load_skills,
+    play,
+    skill_universe,
+    skills,
+)
 from jaxnew.actions import ActionUniverse, random_halves_split
 from jaxnew.observations import RecordingFormat
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
 from jaxnew.rollout.contract import Episode
 from jaxnew.task.budgets import Baselines, StageOneBudget, StageTwoBudget
+from jaxnew.task.places import file_of
 from jaxnew.task.presentation import Film, Filming, Measured, Presentation
 from jaxnew.task.task import Play, Task
 
 
-def _record_block(seed: int, ids: np.ndarray, num_recordings: int) -> np.ndarray:
-    return np.asarray(play.record(jax.random.key(seed), ids, num_recordings))
+def _record_block(
+    seed: int, ids: np.ndarray, num_recordings: int, extra: tuple[str, ...] = ()
+) -> np.ndarray:
+    return np.asarray(play.record(jax.random.key(seed), ids, num_recordings, extra=extra))
+
+
+def _with_skills(name: str) -> Task:
+    """The task with the skills of a user's file behind its own."""
+    path = file_of(name, "Grid World takes a text file with skills such as RR.DD, one per line.")
+    extra = load_skills(path)
+    (own,) = TASK.plays
+    return replace(
+        TASK,
+        make_universe=partial(skill_universe, extra),
+        make_environment=partial(GridWorld, extra=extra),
+        plays=(replace(own, record_block=partial(_record_block, extra=extra)),),
+        universe_name=str(path),
+    )
 
 
 def _draw(env: Any, episode: Episode, *, size: int) -> Film:
@@ -137,6 +164,7 @@ TASK = Task(
         ),
         "paper": _STAGE_TWO,
     },
+    other_universes=_with_skills,
     baselines=Baselines(
         continuous_rollout_share=0.5, sums_gaussian_entropy=True, finetune_share=0.25
     ),

@@ -9,10 +9,16 @@ from typing import Any
 
 import numpy as np
 
-from jaxnew.actions import ActionSplit, ActionUniverse, SplitMismatch, content_hash
+from jaxnew.actions import (
+    ActionIdentity,
+    ActionSplit,
+    ActionUniverse,
+    SplitMismatch,
+    content_hash,
+)
 from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
 
-_TEXTS = ("universe_hash", "split_hash", "source", "hash")
+_TEXTS = ("universe_hash", "split_hash", "source", "play", "encoder_hash", "hash")
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +32,10 @@ class RepresentationTable:
       split_hash: `ActionSplit.hash` of the split whose train actions the encoder learned from;
         None if unknown, or if nothing was learned (engineered vectors).
       source: where the vectors come from, e.g. "hvae-xy, laptop, seed 31".
+      play: modality of the recordings that were encoded, None if there were none, or unknown.
+      encoder_hash: `hash` of the first table that the encoder made, of the actions of its domain;
+        None: this is it.
+      identity: what the actions are, None if unknown.
 
     Raises:
       ValueError: a shape, an id or a value is wrong.
@@ -36,11 +46,21 @@ class RepresentationTable:
     universe_hash: str | None = None
     split_hash: str | None = None
     source: str = "unknown"
+    play: str | None = None
+    encoder_hash: str | None = None
+    identity: ActionIdentity | None = None
 
     def __post_init__(self) -> None:
         vectors = _checked_vectors(np.asarray(self.vectors))
         ids = _checked_ids(np.asarray(self.ids), len(vectors))
         order = np.argsort(ids)
+        if self.identity is not None:
+            if len(self.identity.hashes) != len(ids):
+                raise ValueError(
+                    f"{len(ids)} actions cannot be identified by {len(self.identity.hashes)} "
+                    "hashes; there must be one for each."
+                )
+            object.__setattr__(self, "identity", self.identity.rows(order))
         object.__setattr__(self, "vectors", np.ascontiguousarray(vectors[order]))
         object.__setattr__(self, "ids", ids[order])
 
@@ -48,6 +68,11 @@ class RepresentationTable:
     def hash(self) -> str:
         """Identifies what a policy reads: ids and vectors, not where they come from."""
         return content_hash(self.vectors, self.ids)
+
+    @property
+    def made_by(self) -> str:
+        """Identifies the encoder: equal for tables whose vectors mean the same to a policy."""
+        return self.encoder_hash or self.hash
 
     def rows(self, ids: np.ndarray) -> np.ndarray:
         """f32[n, d] vectors of the actions `ids` int[n].
@@ -97,6 +122,7 @@ class RepresentationTable:
         texts = {name: getattr(self, name) for name in _TEXTS}
         arrays: dict[str, Any] = {"vectors": self.vectors, "ids": self.ids}
         arrays |= {name: np.array(text) for name, text in texts.items() if text is not None}
+        arrays |= self.identity.arrays() if self.identity else {}
         buffer = io.BytesIO()
         np.savez(buffer, **arrays)
         write_bytes_atomically(Path(path), buffer.getvalue())
@@ -119,6 +145,9 @@ class RepresentationTable:
                 universe_hash=texts.get("universe_hash"),
                 split_hash=texts.get("split_hash"),
                 source=texts.get("source", str(path)),
+                play=texts.get("play"),
+                encoder_hash=texts.get("encoder_hash"),
+                identity=ActionIdentity.from_arrays(arrays),
             )
         except ValueError as err:
             raise ValueError(f"{path}: {err}") from err
@@ -141,11 +170,13 @@ def engineered_table(universe: ActionUniverse, name: str) -> RepresentationTable
             f"{universe.name} has no engineered vectors {name!r}; it has "
             f"{sorted(universe.engineered)}."
         )
+    ids = np.arange(universe.num_actions, dtype=np.int32)
     return RepresentationTable(
         vectors=universe.engineered[name],
-        ids=np.arange(universe.num_actions, dtype=np.int32),
+        ids=ids,
         universe_hash=universe.hash,
         source=f"engineered:{name}",
+        identity=ActionIdentity.of(universe, ids),
     )
 
 
@@ -158,11 +189,13 @@ def random_table(universe: ActionUniverse, size: int, seed: int) -> Representati
     if size < 1:
         raise ValueError(f"Random vectors need a size of at least 1, got {size}.")
     vectors = np.random.default_rng(seed).normal(size=(universe.num_actions, size))
+    ids = np.arange(universe.num_actions, dtype=np.int32)
     return RepresentationTable(
         vectors=vectors.astype(np.float32),
-        ids=np.arange(universe.num_actions, dtype=np.int32),
+        ids=ids,
         universe_hash=universe.hash,
         source=f"random:{size}, seed {seed}",
+        identity=ActionIdentity.of(universe, ids),
     )
 
 

@@ -44,6 +44,18 @@ def load_place(place: str, what: str, allowed: str) -> Any:
     return getattr(module, attribute)
 
 
+def file_of(name: str, allowed: str) -> Path:
+    """The file called `name`, with its whole path.
+
+    Raises:
+      UsageError: there is none; it says what is `allowed`.
+    """
+    path = Path(name).expanduser().resolve()
+    if not path.is_file():
+        raise UsageError(f"There is no file {name!r}. {allowed}")
+    return path
+
+
 def budget_of(presets: Mapping[str, Budget], name: str, what: str) -> Budget:
     """The preset called `name`.
 

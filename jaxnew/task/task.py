@@ -20,7 +20,7 @@ from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawRecordings
 from jaxnew.rollout.pool import HostEnvironments, HostPool
 from jaxnew.task.budgets import Baselines, StageOneBudget, StageTwoBudget
-from jaxnew.task.places import budget_of
+from jaxnew.task.places import UsageError, budget_of
 from jaxnew.task.presentation import Presentation
 
 
@@ -160,6 +160,10 @@ class Task:
         training, and splits that are not named, know no groups.
       baselines: settings of the paper's baselines.
       shown: how it is shown.
+      universe_name: of its actions among those of `other_universes`.
+      other_universes: a name or a file -> the same task with the actions of another list, or of the
+        user's file; its `universe_name` is what was given. Raises `UsageError`. None: there are no
+        others.
       actions_name: folder of recordings and encoders, for tasks that share their actions and play;
         also a name that `load_task` takes for one of them. None for a task with its own.
       place: `package.module:NAME` that the task was loaded from, or None for one of the project's;
@@ -186,6 +190,8 @@ class Task:
     )
     baselines: Baselines = field(default_factory=Baselines)
     shown: Presentation = field(default_factory=Presentation)
+    universe_name: str = ""
+    other_universes: Callable[[str], Task] | None = None
     actions_name: str | None = None
     place: str | None = None
 
@@ -226,6 +232,21 @@ class Task:
             return self.make_environment()
         fields = {f.name: getattr(settings, f.name) for f in dataclasses.fields(settings)}
         return self.make_environment(**fields)
+
+    def with_universe(self, name: str) -> Task:
+        """The same task with other actions: those called `name`, or of the file `name`.
+
+        Args:
+          name: see `other_universes`; empty for its own.
+
+        Raises:
+          UsageError: there are no such actions.
+        """
+        if name in ("", self.universe_name):
+            return self
+        if self.other_universes is None:
+            raise UsageError(f"Task {self.name} has no universe {name!r}, only its own.")
+        return self.other_universes(name)
 
     @property
     def action_spec(self) -> ActionSpec:

@@ -85,7 +85,7 @@ def embed(runs: Path, names: Iterable[str], *flags: str) -> list[str]:
                 "--task=shape_stacking",
                 "--budget=smoke",
                 f"--representation={name}",
-                "--observations_per_action=1",
+                "--recordings=1",
                 "--set=model.recordings_per_action=1",
                 f"--set=model.{size}={WIDTH}",
                 f"--runs={runs}",

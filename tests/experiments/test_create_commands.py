@@ -97,7 +97,7 @@ def embed(folder: Path, *names: str) -> None:
         size = "observation_latent" if name == "vae" else "action_latent"
         flags = (f"--representation={name}", f"--set=model.{size}={WIDTH}", f"--runs={folder}")
         # As many as a step of training takes; most of the time is for recording 2,366 tools.
-        flags = (*flags, "--observations_per_action=2")
+        flags = (*flags, "--recordings=2")
         jobs.append(("--task=create-push", "--budget=smoke", *flags))
     run_several("embed", jobs)
 

@@ -14,7 +14,7 @@ import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
 from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
-from jaxnew.embedding import REPRESENTATION_SEED
+from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run
 from jaxnew.storage import metrics

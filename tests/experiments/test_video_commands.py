@@ -12,8 +12,9 @@ import pytest
 
 from envs_host.create.play import PlayConfig, record_images
 from envs_host.create.recorder import Recorder
-from jaxnew.embedding import REPRESENTATION_SEED, collect, embed, parse_representation
+from jaxnew.embedding import embed
 from jaxnew.observations import ObservationsError, Recordings
+from jaxnew.recording import REPRESENTATION_SEED, collect, parse_representation
 from jaxnew.representation.sources import DrawnRecordings, StoredRecordings
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics

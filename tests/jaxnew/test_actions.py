@@ -104,8 +104,8 @@ def test_content_hash_depends_on_type_and_shape_but_not_on_memory_order() -> Non
 
 
 @pytest.mark.unit
-def test_content_keys_are_equal_where_rows_are_equal() -> None:
-    keys = universe_of(np.array([[1, 2], [2, 1], [1, 2]])).content_keys()
+def test_action_hashes_are_equal_where_rows_are_equal() -> None:
+    keys = universe_of(np.array([[1, 2], [2, 1], [1, 2]])).action_hashes
     assert keys[0] == keys[2]
     assert keys[0] != keys[1]
 
@@ -113,7 +113,7 @@ def test_content_keys_are_equal_where_rows_are_equal() -> None:
 @pytest.mark.unit
 def test_zero_and_minus_zero_are_the_same_content() -> None:
     """`content` rows that compare equal are one action; -0.0 appears wherever 0 is negated."""
-    keys = universe_of(np.array([[0.0, 1.0], [-0.0, 1.0]])).content_keys()
+    keys = universe_of(np.array([[0.0, 1.0], [-0.0, 1.0]])).action_hashes
     assert keys[0] == keys[1]
 
 

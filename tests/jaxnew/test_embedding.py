@@ -11,17 +11,9 @@ import numpy as np
 import pytest
 
 from jaxnew.actions import SplitMismatch
-from jaxnew.embedding import (
-    REPRESENTATION_SEED,
-    SPLIT_FILE,
-    TABLE_FILE,
-    Encoder,
-    collect,
-    embed,
-    find_table,
-    parse_representation,
-)
+from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, Encoder, embed, find_table
 from jaxnew.observations import ObservationsError, Recordings
+from jaxnew.recording import REPRESENTATION_SEED, collect, parse_representation
 from jaxnew.representation.table import engineered_table, random_table
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.metrics import read

@@ -78,7 +78,7 @@ def test_new_actions_travel_in_one_file(tmp_path: Path) -> None:
     new = Recordings.load(tmp_path / "new.npz").fits(FORMAT)
     np.testing.assert_array_equal(new.data, found.data)
     assert new.ids.tolist() == [7, 3]
-    assert new.universe_hash is None
+    assert (new.universe_hash, new.hash) == (found.universe_hash, found.hash)
     assert new.action_hashes == found.action_hashes
     # By hand, for actions of no universe.
     np.savez(tmp_path / "hand.npz", ids=[900, 1], recordings=np.array(found.data[:, :1]))

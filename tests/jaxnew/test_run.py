@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.actions import SplitMismatch, mixture_ids
+from jaxnew.actions import ActionIdentity, SplitMismatch, mixture_ids
 from jaxnew.evaluation import measure, summarize
 from jaxnew.representation.table import RepresentationTable, engineered_table
 from jaxnew.run import Evaluation, Run, locate
@@ -148,7 +148,10 @@ def test_whoever_asks_otherwise_gets_a_file_of_its_own(run: Run) -> None:
 def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
     ids = np.array([3, 8, 20, 21], np.int32)
     vectors = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
-    table = RepresentationTable(vectors, ids, None, source="new")
+    identity = ActionIdentity.of(UNIVERSE, ids)
+    table = RepresentationTable(
+        vectors, ids, source="new", encoder_hash=TABLE.hash, identity=identity
+    )
     found = run.evaluate(table=table, episodes=6)
     assert list(found.rows) == [f"table-{table.hash[:8]}"]
     assert f"table-{table.hash[:8]}-best-sampled-m4" in results(run)
@@ -163,12 +166,9 @@ def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
     # One that is hardly trained is almost uniform, but what it likes most is another action.
     own = run.evaluate(ids={"old": ids}, episodes=6, greedy=True).rows["old"]["metrics"]
     assert own != named.rows["table-new"]["metrics"]
-    for wrong in (
-        RepresentationTable(np.ones((4, 2), np.float32), ids, None),
-        RepresentationTable(vectors, np.array([3, 8, 20, 24], np.int32), None),
-    ):
-        with pytest.raises(UsageError, match=r"the policy reads 3 numbers, .* has ids 0\.\.23"):
-            run.evaluate(table=wrong)
+    outside = RepresentationTable(vectors, np.array([3, 8, 20, 24], np.int32))
+    with pytest.raises(SplitMismatch, match=r"has ids up to 24; Ladder-v0 has 0\.\.23"):
+        run.evaluate(table=outside, allow=["other-encoder", "unknown-actions"])
 
 
 @pytest.mark.parametrize(

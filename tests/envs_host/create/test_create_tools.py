@@ -143,7 +143,7 @@ def test_universe_lists_every_tool_once() -> None:
     universe = tool_universe()
     assert universe.num_actions == 2366
     assert universe.class_names == tuple(row[0] for row in TABLE)
-    assert len(set(universe.content_keys())) == 2366
+    assert len(set(universe.action_hashes)) == 2366
     assert len(set(universe.action_names)) == 2366
     assert universe.action_names[1590] == "weighted see-saw s=16 f=1 max=35 w=6 right"
     assert tool_universe(3).num_actions == 10877

@@ -299,7 +299,7 @@ def test_18_split_sizes_hash_and_content() -> None:
     assert random_halves_split(universe, seed=0).hash == split.hash
     assert random_halves_split(universe, seed=1).hash != split.hash
     split.check(universe)
-    keys = universe.content_keys()
+    keys = universe.action_hashes
     parts = [{keys[i] for i in split.ids(name)} for name in ("train", "validation", "test")]
     assert [len(part) for part in parts] == [512, 256, 256]
     assert not parts[0] & parts[1]

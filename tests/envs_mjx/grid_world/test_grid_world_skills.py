@@ -85,7 +85,7 @@ def test_universe() -> None:
     universe = skill_universe()
     assert (universe.name, universe.num_actions) == ("GridWorld-v0", 1024)
     assert (universe.content.shape, universe.content.dtype) == ((1024, 5), np.uint8)
-    assert len(set(universe.content_keys())) == 1024
+    assert len(set(universe.action_hashes)) == 1024
     assert len(set(universe.action_names)) == 1024
     angle = universe.primary_parameter
     assert (angle.min() >= 0, angle.max() < 360, angle.dtype) == (True, True, np.float64)

@@ -211,7 +211,7 @@ def test_universe() -> None:
     assert universe.action_names[690] == shape_name(690) == "cube 0.302 m, 0 deg"
     assert universe.action_names[64] == "hat 0.080 m, 72 deg"
     assert universe.content.shape == (810, 6)
-    assert len(set(universe.content_keys())) == 810
+    assert len(set(universe.action_hashes)) == 810
     # Without its colour a cone is the cone-hires of the same scale.
     np.testing.assert_array_equal(universe.content[360:390, 1:3], universe.content[390:420, 1:3])
 
