@@ -143,13 +143,15 @@ class Encoder:
         """Purity and linear R2 of its table, see `jaxnew.representation.report.describe`; also kept
         in `evaluation/representation.json`.
         """
-        domain = self.domain()
-        targets = domain.task.shown.representation_targets
+        universe = self.task.make_universe().first(len(self.table.ids))
+        split = ActionSplit.load(self.path / SPLIT_FILE)
+        check_same("split", split.hash, self.config.split_hash, self.path)
+        targets = self.task.shown.representation_targets
         numbers = report.describe(
             self.table.vectors,
-            domain.universe.class_labels,
-            held_out=sorted({*domain.split.validation.tolist(), *domain.split.test.tolist()}),
-            targets=targets(domain.universe) if targets else {},
+            universe.class_labels,
+            held_out=sorted({*split.validation.tolist(), *split.test.tolist()}),
+            targets=targets(universe) if targets else {},
         )
         RunDirectory.load(self.path).record_evaluation("representation", numbers)
         return numbers
