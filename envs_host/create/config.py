@@ -19,6 +19,9 @@ SplitPart = Literal["train", "validation", "test", "all"]
 ActionIds = Literal["set", "universe"]
 Observation = Literal["gray", "rgb", "none"]
 
+# Of the environments. Raised by what may move a learning curve (CHANGELOG.md, "Errata").
+VERSION = 1
+
 
 @dataclass(frozen=True)
 class PhysicsConfig:

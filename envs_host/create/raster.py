@@ -41,9 +41,8 @@ def disc(radius: int) -> np.ndarray:
 def line(start: Pixel, end: Pixel, width: int = 1) -> np.ndarray:
     """Pixels of a line, both ends included.
 
-    A wider line is repeated alternately above and below, if it is flat, or left and right. Width 2
-    has the further pixels above or left, so that a bar on the edge of the world (its pixel is the
-    one just outside) still shows one row or column.
+    A wider line is repeated alternately below and above, if it is flat, or right and left, if it is
+    steep or a diagonal. So of an even width the further pixels are below or right.
     """
     rows, columns = end[0] - start[0], end[1] - start[1]
     num_steps = max(abs(rows), abs(columns), 1)
@@ -53,8 +52,8 @@ def line(start: Pixel, end: Pixel, width: int = 1) -> np.ndarray:
          start[1] + (2 * step * columns + num_steps) // (2 * num_steps))
         for step in range(num_steps + 1)
     ]  # fmt: skip
-    is_flat = abs(columns) >= abs(rows)
-    shifts = range(-(width // 2), width - width // 2)
+    is_flat = abs(columns) > abs(rows)
+    shifts = range(-((width - 1) // 2), width // 2 + 1)
     if is_flat:
         return np.array([(row + shift, column) for shift in shifts for row, column in pixels])
     return np.array([(row, column + shift) for shift in shifts for row, column in pixels])

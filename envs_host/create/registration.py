@@ -1,9 +1,10 @@
-"""Gymnasium ids: `jaxnew/CreatePush-v0` with noise, `jaxnew/CreatePushDet-v0` without."""
+"""Gymnasium ids: `jaxnew/CreatePush-v1` with noise, `jaxnew/CreatePushDet-v1` without."""
 
 from __future__ import annotations
 
 import gymnasium
 
+from envs_host.create.config import VERSION
 from envs_host.create.levels.registry import BUILT_IN_NAMES
 
 _ENTRY_POINT = "envs_host.create.environment:CreateEnv"
@@ -18,7 +19,7 @@ def register_environments() -> tuple[str, ...]:
     ids = []
     for name in BUILT_IN_NAMES:
         for suffix, deterministic in (("", False), ("Det", True)):
-            env_id = f"jaxnew/Create{name}{suffix}-v0"
+            env_id = f"jaxnew/Create{name}{suffix}-v{VERSION}"
             ids.append(env_id)
             if env_id not in gymnasium.registry:
                 gymnasium.register(

@@ -94,7 +94,9 @@ class World:
         self.marker_subgoals = [_subgoal(position) for position in level.subgoals_for_marker]
         self.target_subgoals = [_subgoal(position) for position in level.subgoals_for_target]
         self.frame = _frame() if frame_walls else []
-        for thing in self._things():
+        # Not in the order of drawing: target and goal come after the level's objects.
+        subgoals = (*self.marker_subgoals, *self.target_subgoals)
+        for thing in (*self.objects, self.target, self.goal, *subgoals, *self.frame):
             self.stage.add(thing)
         # What may move, of the things whose speed counts.
         self._movers = [

@@ -35,7 +35,7 @@ from jaxnew.task.task import Task
 
 # Fields that tell settings of one method and representation apart in a label, most telling first.
 _LABEL_ORDER = (
-    *("task", "split", "split_seed", "split_hash", "table_hash"),
+    *("task", "environment_version", "split", "split_seed", "split_hash", "table_hash"),
     *("hyperparameters", "num_updates", "ppo", "sets", "environment"),
 )
 _LABEL_CHANGES = 2

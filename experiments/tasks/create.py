@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from envs_host.create.config import CreateRules, RewardConfig
+from envs_host.create.config import VERSION, CreateRules, RewardConfig
 from envs_host.create.hosting import CreateHost
 from envs_host.create.levels import load_level
 from envs_host.create.play import NUM_STATES, STATE_SIZE
@@ -268,6 +268,7 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
             stack_size=3,
             pool_settings=PoolSettings(),
         ),
+        environment_version=VERSION,
         environment=CreateRules(rewards=RewardConfig(with_subgoals=with_subgoals)),
         plays=_PLAYS[spacing],
         stage_one=_STAGE_ONE_BUDGETS,

@@ -82,6 +82,7 @@ class TrainConfig:
       num_clusters: training sets are drawn from half of so many clusters of the representations;
         0 for the paper's runs, which draw from all actions.
       conditions_position: the position's head reads the chosen action.
+      environment_version: see `Task`.
       environment: settings of the environment, of the type of `Task.environment`.
       pool: how environments on the host are run, of the type of `HostDomain.pool_settings`; no part
         of what the run is.
@@ -104,6 +105,7 @@ class TrainConfig:
     split_seed: int = 0
     num_clusters: int = 0
     conditions_position: bool = False
+    environment_version: int = 0
     environment: Any = None
     pool: Any = None
 
@@ -134,6 +136,7 @@ _NOT_SET = {
     "observations_hash": "",
     "train_on": "the -oracle in --representation",
     "trained_on": "",
+    "environment_version": "",
     "start": "",
 }
 
@@ -201,7 +204,8 @@ def read_train_config(
     """The config of a run directory, and its task, which is looked up if it is not given.
 
     Raises:
-      ConfigError: it is of no run of a policy, or was damaged.
+      ConfigError: it is of no run of a policy, was damaged, or is of another version of the task's
+        environment.
       UsageError: there is no such task.
     """
     if "ppo" not in plain or "task" not in plain:
@@ -211,6 +215,13 @@ def read_train_config(
     config = config_lib.from_dict(
         train_config_type(task), {**upgraded(plain), COMPUTED: config_lib.plain(pool)}
     )
+    made, now = config.environment_version, task.environment_version
+    if made != now:
+        raise ConfigError(
+            f"The run was made with version {made} of the environment of {task.name}, which is "
+            f'version {now} now (CHANGELOG.md, "Errata"): train again, or use the jaxnew that made '
+            "it."
+        )
     return config, task
 
 
@@ -220,8 +231,8 @@ def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
         return {"members": [upgraded(member) for member in recorded["members"]]}
     if "ppo" not in recorded:
         return {**recorded, "split_seed": recorded.get("split_seed", 0)}
-    added = {"split_seed": 0, "num_clusters": 0, "conditions_position": False, "environment": []}
-    new: dict[str, Any] = {**added, **recorded}
+    added = {"split_seed": 0, "num_clusters": 0, "conditions_position": False}
+    new: dict[str, Any] = {**added, "environment_version": 0, "environment": [], **recorded}
     rollout = dict(new["ppo"]["rollout"])
     if "set_size" in rollout:  # Until 2026-11-29 sets were part of the rollout.
         names = {"set_size": "size", "padded_set_size": "padded_size", "has_fixed_set": "is_fixed"}

@@ -148,6 +148,8 @@ class Task:
       host: the environments on the host.
       environment: settings of the environment, a frozen dataclass of plain values;
         `set={"environment.FIELD": value}` changes them for a run. None: there is nothing to set.
+      environment_version: raised by changes that may move a learning curve; a run of another
+        version is refused.
       plays: kinds of recordings of the actions, the default first; none for a domain whose
         representations are given. Their modalities have different names.
       stage_one: presets by budget.
@@ -181,6 +183,7 @@ class Task:
     make_environment: Callable[..., Environment] | None = None
     host: HostDomain | None = None
     environment: Any = None
+    environment_version: int = 0
     plays: tuple[Play, ...] = ()
     stage_one: Mapping[str, StageOneBudget] = field(default_factory=dict)
     selection_metric: str = "is_success"

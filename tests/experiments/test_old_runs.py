@@ -1,4 +1,5 @@
-"""Runs of version 0.1.0 load, evaluate, go on, and are told from others.
+"""Runs of version 0.1.0 load, evaluate, go on, and are told from others; those of an environment
+that plays otherwise since do not.
 
 `run_of_0_1_0.tar.gz` is `experiments.train --representation=gt5 --budget=smoke` of that version
 with its checkpoint of update 2, its metrics up to update 4, and an evaluation of 64 test episodes.
@@ -14,8 +15,10 @@ import pytest
 
 from jaxnew.run import Run
 from jaxnew.storage import metrics
-from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.storage.config import ConfigError
+from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory
 from jaxnew.task.settings import identity
+from jaxnew.training import train
 from tests.experiments.commands import read_json, run
 
 pytestmark = pytest.mark.integration
@@ -74,3 +77,24 @@ def test_another_run_is_not_taken_for_it(old: Path) -> None:
     assert "sets.size: 50 recorded, 40 asked for" in output
     assert "environment" not in output
     assert identity(Run.load(old).config) != RunDirectory.load(old).config, "it is left as it was"
+
+
+def test_a_run_in_create_before_its_errata_is_refused(tmp_path: Path) -> None:
+    """Neither evaluated nor resumed; its config is one that was recorded then."""
+    file = Path(__file__).parents[1] / "jaxnew" / "task" / "recorded_configs.json"
+    recorded = next(c for c in read_json(file) if c["task"] == "create-push-no-subgoals")
+    path = tmp_path / "old"
+    RunDirectory.open_or_create(path, recorded).close()
+    with pytest.raises(ConfigError, match=r"version 0 of the environment .* train again"):
+        Run.load(path)
+    with pytest.raises(ConfigMismatch) as error:
+        train(
+            recorded["task"],
+            recorded["representation"],
+            budget="smoke",
+            set={"sets.padded_size": 60},
+            workdir=path,
+            runs=tmp_path,
+        )
+    assert error.value.differences == [("environment_version", 0, 1)]
+    assert "Choose another --workdir to keep that run, or --overwrite" in str(error.value)

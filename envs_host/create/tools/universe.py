@@ -34,6 +34,7 @@ def tool_universe(angle_spacing: int = DEFAULT_SPACING_DEG) -> ActionUniverse:
     parameters = np.array([_parameters(tool) for tool in tools], np.float64)
     suffix = "" if angle_spacing == DEFAULT_SPACING_DEG else f"-{angle_spacing}deg"
     return ActionUniverse(
+        # The version of the list of tools; that of the environments is `config.VERSION`.
         name=f"Create{suffix}-v0",
         class_labels=labels,
         class_names=tuple(tool_class.value for tool_class in CLASS_ORDER),

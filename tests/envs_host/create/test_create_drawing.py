@@ -116,9 +116,10 @@ def test_bars_and_planks() -> None:
     assert rows(draw([bar(46.2, 31.5, 0.0, 16.0, 1.0)])) == [17]
     upright = draw([bar(46.2, 31.5, math.pi / 2, 16.0, 1.0)])
     assert rows(upright) == [1] * 17
-    # Width floor(2.5) = 2, on both sides of the line.
+    # Width floor(2.5) = 2: the line and the row below it, or the column right of it, mirrored.
     assert rows(draw([bar(42.0, 42.0, 0.0, 16.0, 2.5)])) == [17, 17]
-    assert extent(draw([bar(42.0, 42.0, 0.0, 16.0, 2.0)]))[:2] == (41, 42)
+    assert extent(draw([bar(42.0, 42.0, 0.0, 16.0, 2.0)]))[:2] == (42, 43)
+    assert extent(draw([bar(42.0, 42.0, math.pi / 2, 16.0, 2.0)]))[2:] == (83 - 43, 83 - 42)
     plank = frame_of(of_class(ToolClass.LEVER)[0])
     # Length 6: a line of 7, below it a triangle that ends in a base of 5.
     assert rows(plank) == [7, 3, 5]
@@ -126,13 +127,64 @@ def test_bars_and_planks() -> None:
 
 
 @pytest.mark.golden
-def test_one_row_or_column_of_each_frame_wall_is_seen() -> None:
+def test_left_and_top_frame_wall_show_two_pixels_and_the_right_one_none() -> None:
     frame, _ = CreateEnv("Collide", True).reset(seed=0)
     walls = frame == 190
-    assert walls[0].all()
-    assert walls[:, 0].all()
-    assert walls[:, -1].all()
-    assert walls.sum() == 84 + 2 * 83
+    assert walls[:2].all()
+    assert walls[:, -2:].all()  # The world's left is the picture's right.
+    assert walls.sum() == 2 * 84 + 2 * 82
+
+
+def pixels_of_line(sprite: Sprite, size: int) -> np.ndarray:
+    """bool[size, size] of a bar: its ends' pixels, the nearest pixels between them, and copies of
+    these at -((w - 1) // 2)..w // 2 across: below a flat line, right of one that is not."""
+    scale, width = size / 84, max(1, int(int(sprite.width) * size / 84))
+    half = sprite.size / 2 * np.array([-math.sin(sprite.angle), math.cos(sprite.angle)])
+    centre = np.array([84 - sprite.y, sprite.x])
+    start, end = (np.floor((centre + side * half) * scale + 1e-6) for side in (-1, 1))
+    steps = max(1, int(abs(end - start).max()))
+    along = np.arange(steps + 1)[:, None] / steps
+    line = np.floor(start + along * (end - start) + 0.5 + 1e-9).astype(int)
+    is_flat = abs(end - start)[1] > abs(end - start)[0]
+    shifts = np.arange(-((width - 1) // 2), width // 2 + 1)[:, None]
+    across = shifts * (np.array([[1, 0]]) if is_flat else np.array([[0, 1]]))
+    found = (line[None] + across[:, None]).reshape(-1, 2)
+    found = found[((found >= 0) & (found < size)).all(axis=1)]
+    covered = np.zeros((size, size), bool)
+    covered[found[:, 0], size - 1 - found[:, 1]] = True
+    return covered
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("size", [84, 48, 168, 252])
+def test_lines_against_plain_numpy(size: int) -> None:
+    """Frame walls, bars and ramps, of widths 1 to 6 pixels, of all angles, over the edges too."""
+    rng = np.random.default_rng(0)
+    sprites = [s for name in ("Collide", "Cannon", "Belt") for s in bars_of(name)]
+    for tool in of_class(ToolClass.RAMP):
+        sprites += build_tool(tool, tuple(rng.uniform(0, 84, 2))).sprites()
+    for angle in np.radians(range(0, 360, 5)):
+        sprites.append(bar(*rng.uniform(0, 84, 2), angle, rng.uniform(5, 60), 2.0))
+    for sprite in sprites:
+        expected = pixels_of_line(sprite, size)
+        assert np.array_equal(draw([sprite], size=size) != 255, expected), sprite
+        assert np.array_equal((draw([sprite], "rgb", size) != 255).any(axis=2), expected), sprite
+
+
+def bars_of(name: str) -> list[Sprite]:
+    env = CreateEnv(name, True)
+    env.reset(seed=0)
+    return [sprite for sprite in env.world.sprites() if sprite.kind is Kind.BAR]
+
+
+@pytest.mark.golden
+@pytest.mark.parametrize(("angle", "further"), [(44.0, (1, 0)), (45.0, (0, -1)), (46.0, (0, -1))])
+def test_of_a_diagonal_the_further_pixel_is_on_the_right(
+    angle: float, further: tuple[int, int]
+) -> None:
+    """As of steep lines; mirrored it is on the left."""
+    thin, wide = (draw([bar(*CENTRE, math.radians(-angle), 40.0, w)]) != 255 for w in (1.0, 2.0))
+    assert np.array_equal(wide, thin | np.roll(thin, further, axis=(0, 1)))
 
 
 @pytest.mark.golden

@@ -47,7 +47,7 @@ def play(env: CreateEnv, seed: int, num_actions: int = 6) -> list:
 def test_every_registered_environment_passes_gymnasiums_checks(env_id: str) -> None:
     env = gymnasium.make(env_id, config=BLIND)
     check_env(env.unwrapped, skip_render_check=True)
-    assert env.unwrapped.deterministic == env_id.endswith("Det-v0")
+    assert env.unwrapped.deterministic == env_id.endswith("Det-v1")
     env.close()
 
 
@@ -55,7 +55,14 @@ def test_every_registered_environment_passes_gymnasiums_checks(env_id: str) -> N
 def test_ids_are_twelve_tasks_and_a_smoke_level_twice() -> None:
     ids = register_environments()
     assert len(ids) == len(set(ids)) == 26
-    assert {"jaxnew/CreatePush-v0", "jaxnew/CreatePushDet-v0", "jaxnew/CreateGoalTest-v0"} <= {*ids}
+    assert {"jaxnew/CreatePush-v1", "jaxnew/CreatePushDet-v1", "jaxnew/CreateGoalTest-v1"} <= {*ids}
+
+
+@pytest.mark.unit
+@pytest.mark.filterwarnings("ignore:.*out of date")
+def test_earlier_versions_are_refused() -> None:
+    with pytest.raises(gymnasium.error.DeprecatedEnv, match="use `jaxnew/CreatePush-v1` instead"):
+        gymnasium.make("jaxnew/CreatePush-v0")
 
 
 @pytest.mark.contract

@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from envs_host.create.config import VERSION as CREATE_VERSION
 from envs_host.create.config import CreateConfig, CreateRules, PhysicsConfig, RewardConfig
 from envs_host.create.hosting import CreateHost
 from envs_host.pool import PoolSettings
@@ -42,7 +43,7 @@ from tests import toy_device, toy_task
 RECORDED = json.loads((Path(__file__).parent / "recorded_configs.json").read_text())
 NOT_SET = (
     *("task", "method", "representation", "table_hash", "split", "split_seed", "split_hash"),
-    *("seed", "trained_on", "start"),
+    *("seed", "trained_on", "start", "environment_version"),
 )
 
 
@@ -400,10 +401,12 @@ def test_configs_of_the_revision_before_are_read(recorded: dict[str, Any]) -> No
         expected = with_set(expected, {"num_updates": 3})
     if recorded["task"] == "create-push-no-subgoals":
         expected = with_set(expected, {"sets.padded_size": 60})
+        # Before CREATE's errata.
+        expected, task = (replace(value, environment_version=0) for value in (expected, task))
     assert "set_size" in recorded["ppo"]["rollout"]
     before = json.dumps(recorded)
     assert differences(upgraded(recorded), identity(expected)) == []
-    assert read_train_config(recorded) == (expected, task)
+    assert read_train_config(recorded, task) == (expected, task)
     assert json.dumps(recorded) == before, "what was read is left alone"
     older = {k: v for k, v in recorded.items() if k not in ("num_clusters", "conditions_position")}
     assert upgraded(older) == upgraded(recorded)
@@ -428,6 +431,27 @@ class OtherSettings:
     """Of another task than the run's."""
 
     height: int = 3
+
+
+@pytest.mark.unit
+def test_a_run_of_another_version_of_the_environment_is_refused() -> None:
+    old = next(recorded for recorded in RECORDED if recorded["task"] == "create-push-no-subgoals")
+    says = r"version 0 of the environment of create-push-.*, which is version 1 now .*: train again"
+    for plain in (old, {**identity(config_of(load_task(old["task"]))), "environment_version": 0}):
+        with pytest.raises(ConfigError, match=says):
+            read_train_config(plain)
+    newer = {**identity(LADDER), "environment_version": 2}
+    with pytest.raises(ConfigError, match=r"version 2 of .* which is version 0 now"):
+        read_train_config(newer)
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize("name", ["grid_world", "recommender", "shape_stacking", "create-push"])
+def test_versions_of_environments_are_those_in_their_names(name: str) -> None:
+    task = load_task(name)
+    version = CREATE_VERSION if task.host else int(task.environment_of().name.rpartition("-v")[2])
+    assert task.environment_version == version
+    assert config_of(task).environment_version == version
 
 
 @pytest.mark.unit
