@@ -10,7 +10,7 @@ from them.
 from __future__ import annotations
 
 from experiments.flags import Arguments
-from jaxnew.embedding import collect, parse_representation
+from jaxnew.embedding import collect, parse_representation, stores
 from jaxnew.task.domain import Domain, load_task
 
 ARGUMENTS = Arguments(
@@ -24,13 +24,12 @@ def main() -> None:
     if ARGUMENTS.is_given("representation"):
         play = parse_representation(domain, ARGUMENTS.representation).play
     budget = domain.stage_one(play, ARGUMENTS.budget)
-    stores_drawn = ARGUMENTS.stores_drawn
     recordings = collect(
         domain,
         ARGUMENTS.runs,
         ARGUMENTS.observations_per_action or budget.num_recordings,
         play,
-        budget.stores_drawn if stores_drawn is None else stores_drawn,
+        stores(play, budget, ARGUMENTS.stores_drawn),
     )
     for made in (recordings.recorded, recordings.drawn):
         if made is not None:

@@ -16,21 +16,11 @@ from jaxnew.embedding import REPRESENTATION_SEED, Encoder, embed
 from jaxnew.observations import Recordings
 from jaxnew.task.places import UsageError
 
-ARGUMENTS = Arguments(
-    __doc__,
-    "task",
-    "representation",
-    "split",
-    "split_seed",
-    "budget",
-    "seed",
-    "workdir",
-    "runs",
-    "overwrite",
-    "set",
-    "observations_per_action",
-    "frames",
+_OF_TRAINING = (
+    *("task", "representation", "split", "split_seed", "budget", "seed", "workdir", "runs"),
+    *("overwrite", "set", "observations_per_action", "frames"),
 )
+ARGUMENTS = Arguments(__doc__, *_OF_TRAINING)
 ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
 ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
 ARGUMENTS.define("string", "output", None, "Where to write the table of the new actions (.npz).")
@@ -39,6 +29,7 @@ ARGUMENTS.define("string", "output", None, "Where to write the table of the new 
 def main() -> None:
     given = [ARGUMENTS.checkpoint, ARGUMENTS.observations, ARGUMENTS.output]
     if all(given):
+        ARGUMENTS.refuse(_OF_TRAINING, "with --checkpoint")
         encode_new_actions(*map(Path, given))
     elif any(given):
         raise UsageError(

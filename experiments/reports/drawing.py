@@ -166,16 +166,21 @@ def tsne_figure(run: RunRecord, part: str) -> Figure | None:
     """Representations of one part of the split, by class; None if it has too few actions."""
     if run.table is None or run.split is None:
         return None
-    config = run.config
-    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
-    domain = replace(domain, split=run.split)
-    panel = tsne_panel(domain, run.table, part, int(config["seed"]))
+    domain = domain_of(run)
+    panel = tsne_panel(domain, run.table, part, int(run.config["seed"]))
     if panel is None:
         print(f"{run.path}: too few actions for a picture of part {part!r}.")
         return None
     name = {"heldout": "held-out"}.get(part, part)
     title = f"{run.representation}: {name} actions"
     return plots.tsne_scatter([panel], domain.universe.class_names, title)
+
+
+def domain_of(run: RunRecord) -> Domain:
+    """The domain of a run, with the split that the run kept."""
+    config = run.config
+    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
+    return replace(domain, split=run.split or domain.split)
 
 
 def tsne_panel(

@@ -20,7 +20,7 @@ from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawRecordings
 from jaxnew.rollout.pool import HostEnvironments, HostPool
 from jaxnew.task.budgets import Baselines, StageOneBudget, StageTwoBudget
-from jaxnew.task.places import budget_of
+from jaxnew.task.places import UsageError, budget_of
 from jaxnew.task.presentation import Presentation
 
 
@@ -241,6 +241,18 @@ class Task:
     def default_split(self) -> str:
         """Name of the first split."""
         return next(iter(self.splits))
+
+    def check_workers(self, num_workers: int) -> None:
+        """Refuses processes for environments that take none.
+
+        Raises:
+          UsageError: there are some, and the environments run inside jit.
+        """
+        if num_workers and self.host is None:
+            raise UsageError(
+                f"num_workers={num_workers}: the environments of {self.name} run inside jit, not "
+                "in processes of their own; leave it out (--workers)."
+            )
 
     def budget(self, name: str) -> StageTwoBudget:
         """The preset of stage two called `name`.
