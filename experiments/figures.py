@@ -1,4 +1,4 @@
-"""Figures and a table of results from run directories, with the paper's numbers beside ours.
+"""Figures and a table of results from run directories, with the paper's numbers beside jaxnew's.
 
     python -m experiments.figures --run=RUN,RUN,RUN --out=DIRECTORY
     python -m experiments.figures --figure=4,6,24 --task=grid_world --budget=paper

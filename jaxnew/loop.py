@@ -167,7 +167,8 @@ def run(
     with progress, session.log, _interruption() as is_interrupted:
         session.start_clock()
         if session.step < total_steps:
-            progress.update(session.step, "compiling")
+            first = min(rhythm.chunk_steps, total_steps - session.step)
+            progress.update(session.step, f"compiling, and the first {first}")
         while session.step < total_steps:
             if is_interrupted():
                 was_interrupted = True

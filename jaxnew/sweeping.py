@@ -265,8 +265,8 @@ def sweep(
     with RunDirectory.open_or_create(path, recorded, overwrite, upgrade=upgraded) as directory:
         print(
             f"{len(configs)} members on {len(program.devices)} device(s), {base.num_updates} "
-            f"updates each ({len(configs)} x {foretold(preset, base)}, less what they share) in "
-            f"{path}."
+            f"updates each ({foretold(preset, base)}; {len(configs)} times that, less what they "
+            f"share) in {path}."
         )
         result = loop.run(
             program.init(),
