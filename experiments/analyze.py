@@ -71,6 +71,8 @@ def main() -> None:
         study = search(ARGUMENTS.study, own, cell, values, ARGUMENTS.dry_run)
     else:
         ARGUMENTS.refuse(_OF_SEARCHES, "for a study of runs")
+        if ARGUMENTS.study != "recordings":
+            ARGUMENTS.refuse(("encoder",), f"for --study={ARGUMENTS.study}")
         paths = [Path(path) for path in ARGUMENTS.run]
         folder = Path(*paths[:1]).parent
         study = study_runs(

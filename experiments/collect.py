@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from experiments.flags import Arguments
 from jaxnew.observations import Recordings
-from jaxnew.recording import collect, parse_representation, record
+from jaxnew.recording import collect, parse_representation, record, stores
 from jaxnew.task.domain import Domain, load_task
 
 ARGUMENTS = Arguments(
@@ -49,13 +49,12 @@ def main() -> None:
     if ARGUMENTS.is_given("representation"):
         play = parse_representation(domain, ARGUMENTS.representation).play
     budget = domain.stage_one(play, ARGUMENTS.budget)
-    stores_drawn = ARGUMENTS.stores_drawn
     recordings = collect(
         domain,
         ARGUMENTS.runs,
         ARGUMENTS.recordings or budget.num_recordings,
         play,
-        budget.stores_drawn if stores_drawn is None else stores_drawn,
+        stores(play, budget, ARGUMENTS.stores_drawn),
     )
     for each in (recordings.recorded, recordings.drawn):
         if each is not None:

@@ -17,21 +17,11 @@ from jaxnew.observations import Recordings
 from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.task.places import UsageError
 
-ARGUMENTS = Arguments(
-    __doc__,
-    "task",
-    "representation",
-    "split",
-    "split_seed",
-    "budget",
-    "seed",
-    "workdir",
-    "runs",
-    "overwrite",
-    "set",
-    "recordings",
-    "frames",
+_OF_TRAINING = (
+    *("task", "representation", "split", "split_seed", "budget", "seed", "workdir", "runs"),
+    *("overwrite", "set", "recordings", "frames"),
 )
+ARGUMENTS = Arguments(__doc__, *_OF_TRAINING)
 ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
 ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
 ARGUMENTS.define("string", "output", None, "Where to write the table of the new actions (.npz).")
@@ -40,6 +30,7 @@ ARGUMENTS.define("string", "output", None, "Where to write the table of the new 
 def main() -> None:
     given = [ARGUMENTS.checkpoint, ARGUMENTS.observations, ARGUMENTS.output]
     if all(given):
+        ARGUMENTS.refuse(_OF_TRAINING, "with --checkpoint")
         encode_new_actions(*map(Path, given))
     elif any(given):
         raise UsageError(

@@ -4,6 +4,8 @@ python -m experiments.evaluate --run=RUN --sets=train,validation,test --episodes
 python -m experiments.evaluate --run=RUN --ids=ids.txt
 python -m experiments.evaluate --run=RUN --table=new_table.npz
 python -m experiments.evaluate --run=RUN --unseen_ratio=0.4
+
+RUN may be a sweep: all its runs are evaluated, and shown in one table by what was varied.
 """
 
 from __future__ import annotations
@@ -12,14 +14,17 @@ from pathlib import Path
 from typing import Any
 
 from experiments.flags import Arguments
+from experiments.reports.sweeps import show_sweep
 from jaxnew.actions import load_ids
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Run
+from jaxnew.run import Evaluation, Run, locate
+from jaxnew.runs import Runs, is_sweep
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.places import UsageError
 
 ARGUMENTS = Arguments(__doc__, "workers", "set", "universe")
-ARGUMENTS.define("string", "run", None, "Run directory of train, or a checkpoint in it.")
+ARGUMENTS.define("string", "run", None, "Run directory of train or sweep, or a checkpoint in it.")
 ARGUMENTS.define(
     "enum",
     "checkpoint",
@@ -54,20 +59,39 @@ ARGUMENTS.define("integer", "evaluation_seed", EVALUATION_SEED, "Seed of the epi
 def main() -> None:
     if ARGUMENTS.run is None:
         raise UsageError("Say which run to evaluate: --run=DIRECTORY.")
+    if not ARGUMENTS.grows_from:
+        ARGUMENTS.refuse(("growth",), "without --grows_from")
+    directory = RunDirectory.load(locate(Path(ARGUMENTS.run))[0])
+    if is_sweep(directory):
+        evaluate_sweep(Runs.load(directory.path))
+        return
     with Run.load(
         ARGUMENTS.run, ARGUMENTS.checkpoint, num_workers=ARGUMENTS.workers, set=ARGUMENTS.set
     ) as run:
-        print(
-            run.evaluate(
-                episodes=ARGUMENTS.episodes,
-                set_size=ARGUMENTS.set_size,
-                grows_from=ARGUMENTS.grows_from,
-                growth=ARGUMENTS.growth,
-                greedy=ARGUMENTS.deterministic,
-                seed=ARGUMENTS.evaluation_seed,
-                **drawn_from(run),
-            )
-        )
+        print(evaluated(run))
+
+
+def evaluate_sweep(runs: Runs) -> None:
+    """Every run of a sweep, and one table."""
+    ARGUMENTS.refuse(("workers", "set"), "for a sweep, which has no environments on the host")
+    for run in runs.load_each(ARGUMENTS.checkpoint or "best"):
+        evaluated(run)
+        print(f"{run.path} evaluated.", flush=True)
+    for file in show_sweep(runs):
+        print(file)
+
+
+def evaluated(run: Run) -> Evaluation:
+    """What the flags ask of a run."""
+    return run.evaluate(
+        episodes=ARGUMENTS.episodes,
+        set_size=ARGUMENTS.set_size,
+        grows_from=ARGUMENTS.grows_from,
+        growth=ARGUMENTS.growth,
+        greedy=ARGUMENTS.deterministic,
+        seed=ARGUMENTS.evaluation_seed,
+        **drawn_from(run),
+    )
 
 
 def drawn_from(run: Run) -> dict[str, Any]:

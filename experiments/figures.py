@@ -1,7 +1,8 @@
-"""Figures and a table of results from run directories, with the paper's numbers beside ours.
+"""Figures and a table of results from run directories, with the paper's numbers beside jaxnew's.
 
     python -m experiments.figures --run=RUN,RUN,RUN --out=DIRECTORY
     python -m experiments.figures --figure=4,6,24 --task=grid_world --budget=paper
+    python -m experiments.figures --figure=4 --add=RUN,SWEEP
     python -m experiments.figures --figure=8 --run=RUN
     python -m experiments.figures --figure=8 --run=RUN --film_size=400 --film_pages
 
@@ -34,12 +35,15 @@ from experiments.reports.drawing import (
     curves_figure,
     tsne_figures,
 )
-from experiments.reports.figure_list import FIGURES
+from experiments.reports.figure_list import FIGURES, number_of
 from experiments.reports.films import FilmOptions, animate_run, film_run
-from experiments.reports.paper_figures import Options
+from experiments.reports.paper_figures import ADDED_TO, Options
 from experiments.reports.production import Source
 from experiments.reports.results import as_csv, as_markdown, result_rows
 from experiments.reports.runs import Group, group_runs, policies, read_runs
+from experiments.reports.sweeps import show_sweep, sweep_figure
+from jaxnew.runs import MEMBERS, Runs, is_sweep
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
 
@@ -57,6 +61,13 @@ ARGUMENTS = Arguments(
 ARGUMENTS.define("list", "run", [], "Run directories of train, sweep or embed.")
 ARGUMENTS.define(
     "list", "figure", [], f"Figures of the paper to find or make runs for: {', '.join(FIGURES)}."
+)
+ARGUMENTS.define(
+    "list",
+    "add",
+    [],
+    "Finished runs or sweeps to show in figures of bars, curves, studies and representations, "
+    "beside the paper's settings: one's own method, head or representation.",
 )
 ARGUMENTS.define("string", "out", None, "Where to write; default: `figures/` of the one run.")
 ARGUMENTS.define("bool", "pdf", False, "Also write every figure as PDF.")
@@ -81,10 +92,20 @@ ARGUMENTS.define(
 )
 ARGUMENTS.define("bool", "film_pages", False, "Interactive pages as well, of stacking; needs Brax.")
 
+# Flags that only some kinds of figures use.
+_FILMS = ("films", "film_size", "film_format", "film_pages")
+_OF_KINDS = {
+    _FILMS: ("films",),
+    ("finetune_steps",): ("finetune",),
+    ("episodes",): ("bars", "study", "finetune"),
+    ("pdf",): ("bars", "curves", "finetune", "representations", "study"),
+    ("seeds", "steps", "set", "workers"): ("bars", "curves", "finetune", "films", "study"),
+    ("add",): ADDED_TO,
+}
 # Flags that are about runs yet to be made.
 _PRODUCTION = (
     *("split", "split_seed", "budget", "representation_budget", "runs", "set", "seeds", "steps"),
-    *("finetune_steps", "episodes", "given", "dry_run"),
+    *("finetune_steps", "episodes", "given", "dry_run", "add"),
 )
 
 
@@ -98,6 +119,7 @@ def main() -> None:
         ARGUMENTS.refuse(("episode",), "with --figure")
         out = Path(ARGUMENTS.out) if ARGUMENTS.out else None
         source = Source.asked_for(ARGUMENTS, paper_figures.parse_given(ARGUMENTS.given))
+        refuse_unused(source.domain.task.name)
         files = paper_figures.make(ARGUMENTS.figure, source, options(), out, ARGUMENTS.dry_run)
     else:
         files = draw_given(paths)
@@ -105,11 +127,24 @@ def main() -> None:
         print(file)
 
 
+def refuse_unused(task: str) -> None:
+    """Refuses flags that none of the figures uses.
+
+    Raises:
+      UsageError: one is given, or there is no such figure of the task.
+    """
+    shown = {FIGURES[number_of(number, task)].kind for number in ARGUMENTS.figure}
+    for names, kinds in _OF_KINDS.items():
+        if not shown.intersection(kinds):
+            ARGUMENTS.refuse(names, f"for figures of {', '.join(sorted(shown))}")
+
+
 def options() -> Options:
     """What is asked of the paper's figures."""
     suffix = f".{ARGUMENTS.film_format}"
     films = FilmOptions(ARGUMENTS.films, ARGUMENTS.film_size, suffix, ARGUMENTS.film_pages)
-    return Options(ARGUMENTS.episodes, ARGUMENTS.finetune_steps, ARGUMENTS.pdf, films)
+    added = tuple(map(Path, ARGUMENTS.add))
+    return Options(ARGUMENTS.episodes, ARGUMENTS.finetune_steps, ARGUMENTS.pdf, films, added)
 
 
 def film_given(paths: Sequence[Path]) -> list[Path]:
@@ -132,8 +167,7 @@ def film_given(paths: Sequence[Path]) -> list[Path]:
 
 def draw_given(paths: Sequence[Path]) -> list[Path]:
     """All figures of runs that are given."""
-    films = ("films", "film_size", "film_format", "film_pages")
-    ARGUMENTS.refuse(("task", "workers", *films, *_PRODUCTION), "without --figure")
+    ARGUMENTS.refuse(("task", "workers", *_FILMS, *_PRODUCTION), "without --figure")
     if not ARGUMENTS.out and len(paths) > 1:
         raise UsageError("Several runs: say where their figures go with --out=DIRECTORY.")
     out = Path(ARGUMENTS.out) if ARGUMENTS.out else Path(*paths[:1]) / "figures"
@@ -167,7 +201,7 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
     written = []
     if groups:
         rows = {group.label: result_rows(group) for group in groups}
-        notes = [note for group in groups for note in missing_from(group)]
+        notes = list(dict.fromkeys(note for group in groups for note in missing_from(group)))
         for note in notes:
             print(note)
         for name, figure in (
@@ -180,6 +214,11 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
         notes += notes_of(groups)
         text = as_markdown(groups[0].place, flat, groups[0].metric, notes)
         written += tables.write(out, "results", text, as_csv(flat))
+    for path in run_paths:
+        if is_sweep(RunDirectory.load(path)):
+            stem = "sweep" if len(run_paths) == 1 else f"sweep_{path.name}"
+            sweep = Runs.load(path)
+            written += sweep_figure(sweep, out, stem, pdf) + show_sweep(sweep, out, stem)
     for name, figure in tsne_figures(runs):
         written += plots.save(figure, out / f"{name}.png", pdf)
     return written
@@ -189,16 +228,18 @@ def missing_from(group: Group) -> list[str]:
     """A line for each run without any evaluation during training, or without one of the bars."""
     lines = []
     for run in group.runs:
+        # All members of a sweep are evaluated by one command.
+        path = run.path.parents[1] if run.path.parent.name == MEMBERS else run.path
         curves = [run.curve(f"{s}/{group.task.selection_metric}")[0] for s in CURVE_SPLITS]
         if not any(map(len, curves)):
             lines.append(
-                f"{run.path} has no evaluations in its metrics.jsonl yet, so no learning curve."
+                f"{path} has no evaluations in its metrics.jsonl yet, so no learning curve."
             )
         lacking = [part for part in BAR_SPLITS if run.answer(group.standard(part)) is None]
         if lacking:
             lines.append(
-                f"{run.path} has no evaluation on {' and '.join(lacking)} actions; make it "
-                f"with: python -m experiments.evaluate --run={shlex.quote(str(run.path))} "
+                f"{path} has no evaluation on {' and '.join(lacking)} actions; make it "
+                f"with: python -m experiments.evaluate --run={shlex.quote(str(path))} "
                 f"--sets={','.join(lacking)} --episodes=5000"
             )
     return lines

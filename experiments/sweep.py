@@ -3,18 +3,20 @@
     python -m experiments.sweep --representation=gt12 --seeds=31,41,51,61
         --vary=entropy_coefficient=0.01,0.05 --vary=learning_rate=3e-4,1e-3
 
-Every combination becomes an ordinary run directory, as `train` would have made it.
+Every combination becomes an ordinary run directory, as `train` would have made it. The end is a
+table by what was varied, which `evaluate --run=SWEEP` and `figures --run=SWEEP` show again with the
+evaluations that were made meanwhile.
 """
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
 import jax
 
 from experiments.flags import Arguments
+from experiments.reports.sweeps import show_sweep
 from jaxnew.cores import available_cores
 from jaxnew.sweeping import sweep
 from jaxnew.task.places import UsageError
@@ -64,11 +66,9 @@ def main() -> None:
         overwrite=ARGUMENTS.overwrite,
         members_at_once=ARGUMENTS.members_at_once,
     )
-    for row in found.table():
-        print(f"{row['path']}: seed {row['seed']}, {found.selection_metric} {row['best_metric']}")
-    rated = [row for row in found.table() if row["best_metric"] is not None]
-    if rated:
-        print(json.dumps(max(rated, key=lambda row: row["best_metric"])))
+    if found.rows:
+        for file in show_sweep(found):
+            print(file)
 
 
 def varied(entry: str) -> tuple[str, list[float]]:

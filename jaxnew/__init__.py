@@ -38,7 +38,7 @@ _HOMES = {
     "Rollout": "jaxnew.rollout.contract",
     "RolloutConfig": "jaxnew.rollout.contract",
     "Run": "jaxnew.run",
-    "Runs": "jaxnew.sweeping",
+    "Runs": "jaxnew.runs",
     "Task": "jaxnew.task.task",
     "Trainer": "jaxnew.trainer",
     "collect": "jaxnew.recording",

@@ -27,11 +27,11 @@ from jaxnew.rollout.device import DeviceRollout as DeviceRollout
 from jaxnew.rollout.host import HostRollout as HostRollout
 from jaxnew.run import Evaluation as Evaluation
 from jaxnew.run import Run as Run
+from jaxnew.runs import Runs as Runs
 from jaxnew.sampling import ActionPool as ActionPool
 from jaxnew.sampling import Actions as Actions
 from jaxnew.sampling import AvailableSet as AvailableSet
 from jaxnew.sampling import draw_sets as draw_sets
-from jaxnew.sweeping import Runs as Runs
 from jaxnew.sweeping import sweep as sweep
 from jaxnew.task.domain import Domain as Domain
 from jaxnew.task.domain import load_task as load_task

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +20,10 @@ from jaxnew.recording import (
     PlayRecordings,
     collect,
     parse_representation,
+    stores,
 )
 from jaxnew.representation import report
+from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.learner import RepresentationLearner, RepresentationState
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import RecordingSource
@@ -29,7 +31,7 @@ from jaxnew.representation.table import RepresentationTable, engineered_table, r
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.budgets import StageOneBudget
+from jaxnew.task.budgets import StageOneBudget, scaled_cost
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
@@ -200,12 +202,18 @@ def embed(
         runs,
         num_recordings or preset.num_recordings,
         learned.play,
-        preset.stores_drawn if stores_drawn is None else stores_drawn,
+        stores(learned.play, preset, stores_drawn),
     )
     base = _config(domain, representation, learned.kind, preset, recordings, seed)
     config = with_set(base, set)
     title = f"embed-{representation}-{domain.split_label}-{budget}-{seed}"
     path = Path(workdir) if workdir else domain.actions_folder(Path(runs)) / title
+    shares = {
+        "steps": config.model.num_steps / base.model.num_steps,
+        "batches": _batch_size(config.model) / _batch_size(base.model),
+        "recordings": recordings.recorded.num_recordings / preset.num_recordings,
+    }
+    preset = replace(preset, cost=scaled_cost(preset.cost, **shares))
     provenance = {"split_hash": domain.split.hash}
     with RunDirectory.open_or_create(
         path, identity(config), overwrite, provenance, upgrade=upgraded
@@ -213,6 +221,10 @@ def embed(
         source = f"{representation}, {budget}, seed {config.seed}"
         _train(directory, domain, config, learned.modality, preset, recordings, source)
     return Encoder.load(path, task)
+
+
+def _batch_size(model: RepresentationConfig) -> int:
+    return model.actions_per_batch * model.recordings_per_action
 
 
 def _config(
@@ -304,6 +316,13 @@ def _train_chunk(
 def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:
     """int32[n] the actions of a part of the split, and those that are in every set."""
     return np.union1d(split.ids(part), split.always_available)
+
+
+def is_learned(representation: str) -> bool:
+    """Whether a representation is the name of one that is learned, not of a file or a run."""
+    path = Path(representation)
+    is_place = path.is_dir() or path.suffix == ".npz"
+    return representation.startswith(("hvae", "vae")) and not is_place
 
 
 def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> RepresentationTable:

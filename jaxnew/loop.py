@@ -166,6 +166,9 @@ def run(
     was_interrupted = False
     with progress, session.log, _interruption() as is_interrupted:
         session.start_clock()
+        if session.step < total_steps:
+            first = min(rhythm.chunk_steps, total_steps - session.step)
+            progress.update(session.step, f"compiling, and the first {first}")
         while session.step < total_steps:
             if is_interrupted():
                 was_interrupted = True
@@ -177,9 +180,9 @@ def run(
                 progress.restart_clock(session.step)
             progress.update(session.step, _note(rate, metrics, display.metrics))
             is_last = session.step >= total_steps
-            is_due = _is_passed(rhythm.checkpoint_every, before, session.step)
+            is_due = is_passed(rhythm.checkpoint_every, before, session.step)
             if evaluate is not None and (
-                is_last or _is_passed(rhythm.evaluate_every, before, session.step)
+                is_last or is_passed(rhythm.evaluate_every, before, session.step)
             ):
                 is_due = session.evaluate(evaluate) or is_due
             if is_due:
@@ -198,7 +201,7 @@ def run(
     )
 
 
-def _is_passed(interval: int | None, before: int, after: int) -> bool:
+def is_passed(interval: int | None, before: int, after: int) -> bool:
     """Whether a multiple of `interval` lies in (before, after]."""
     return interval is not None and after // interval > before // interval
 

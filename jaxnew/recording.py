@@ -19,6 +19,7 @@ from jaxnew.actions import SPLIT_NAMES, ActionIdentity, ActionUniverse, load_ids
 from jaxnew.observations import RecordingFormat, Recordings
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
+from jaxnew.task.budgets import StageOneBudget
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from jaxnew.task.task import Drawing, Play, Task
@@ -136,6 +137,17 @@ def collect(
         return PlayRecordings(play, recorded)
     drawn = _draw_all(folder, drawing, domain.universe, recorded, seed)
     return PlayRecordings(play, recorded, drawn)
+
+
+def stores(play: Play, preset: StageOneBudget, stores_drawn: bool | None) -> bool:
+    """Whether what is drawn is stored: what was said, else what the preset says.
+
+    Raises:
+      UsageError: something was said, and nothing is drawn.
+    """
+    if stores_drawn is not None and play.drawing is None:
+        raise UsageError("These recordings are no drawn frames; leave out --frames (stores_drawn).")
+    return preset.stores_drawn if stores_drawn is None else stores_drawn
 
 
 def record(

@@ -5,8 +5,10 @@ Every member ends as an ordinary run directory, as `train` would have made it.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from pathlib import Path
@@ -22,12 +24,13 @@ from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.ppo import Hyperparameters, TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.device import DeviceRollout
-from jaxnew.run import Run
+from jaxnew.runs import MEMBERS, Runs
 from jaxnew.sampling import Actions
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, plain
 from jaxnew.storage.metrics import MetricsLog, read
 from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.budgets import foretold
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import file_name, variant_of
 from jaxnew.task.places import UsageError
@@ -193,9 +196,9 @@ class SweepProgram:
         """Updates, and an evaluation where one is due; metrics are named `MEMBER/metric`."""
         members, metrics = self._updates(state.members, self.hyperparameters, n=num_updates)
         state = replace(state, members=members)
-        config = self.trainer.config
-        is_last = state.step == config.num_updates
-        if is_last or state.step % config.loop.evaluate_every == 0:
+        config, step = self.trainer.config, state.step
+        is_last = step == config.num_updates
+        if is_last or loop.is_passed(config.loop.evaluate_every, step - num_updates, step):
             results = self._evaluation(members)
             state = self._keep_best(state, results[self.trainer.selection_metric])
             metrics = {**metrics, **results}
@@ -205,50 +208,6 @@ class SweepProgram:
             for name, value in values.items()
             for member in range(len(self.configs))
         }
-
-
-@dataclass(frozen=True)
-class Runs:
-    """The runs of a sweep, one per seed and combination of what was varied.
-
-    Attributes:
-      path: directory of the sweep.
-      rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
-        hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
-      task: what they were trained on.
-    """
-
-    path: Path
-    rows: tuple[Mapping[str, Any], ...]
-    task: Task
-
-    @property
-    def selection_metric(self) -> str:
-        """What `best_metric` is."""
-        return f"validation/{self.task.selection_metric}"
-
-    def table(self) -> list[dict[str, Any]]:
-        """Rows for `pandas.DataFrame`."""
-        return [dict(row) for row in self.rows]
-
-    def __len__(self) -> int:
-        return len(self.rows)
-
-    def __iter__(self) -> Iterator[Run]:
-        """Loads one run after the other."""
-        return (Run.load(row["path"], task=self.task) for row in self.rows)
-
-    def best(self) -> Run:
-        """The run with the highest validation.
-
-        Raises:
-          UsageError: the sweep was interrupted, or nothing was evaluated.
-        """
-        rated = [row for row in self.rows if row["best_metric"] is not None]
-        if not rated:
-            raise UsageError(f"{self.path} has no evaluated runs; sweep again to go on.")
-        best = max(rated, key=lambda row: row["best_metric"])
-        return Run.load(best["path"], task=self.task)
 
 
 def sweep(
@@ -275,7 +234,8 @@ def sweep(
         as of `train`.
       seeds: of the members, each once.
       vary: values by field of `Hyperparameters`.
-      workdir: directory of the sweep, whose `members/` are the runs; default: below `runs`.
+      workdir: directory of the sweep, whose `members/` are the runs; default: below `runs`, under
+        a name that no other sweep has.
       members_at_once: members that a device vmaps; 0: all, or 1 on CPUs.
 
     Raises:
@@ -290,34 +250,44 @@ def sweep(
     domain, runs = Domain.of(task, split, split_seed), Path(runs)
     variant_of(method)  # Before a representation is trained for it.
     listed = checked_seeds(seeds)
-    name, found = named_table(domain, runs, table, representation_budget or budget)
+    name, found = named_table(domain, runs, table, budget, representation_budget)
     preset = task.budget(budget)
     base = with_set(train_config(domain, method, name, found, preset, listed[0]), set)
     configs = member_configs(base, listed, vary or {})
     trainer = Trainer.of(configs[0], task, domain.split, found)
     program = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
+    members = [identity(config) for config in configs]
     words = ["sweep", file_name(method), Path(name).stem]
     words += [domain.split_label] * (domain.split_label != task.default_split)
+    words += [budget, *(vary or {}), _digest(members)]
     path = Path(workdir or domain.folder(runs) / "-".join(words))
-    members = {"members": [identity(config) for config in configs]}
-    with RunDirectory.open_or_create(path, members, overwrite, upgrade=upgraded) as directory:
+    recorded = {MEMBERS: members}
+    with RunDirectory.open_or_create(path, recorded, overwrite, upgrade=upgraded) as directory:
         print(
             f"{len(configs)} members on {len(program.devices)} device(s), {base.num_updates} "
-            f"updates each ({len(configs)} x {preset.cost}, less what they share) in {path}."
+            f"updates each ({foretold(preset, base)}; {len(configs)} times that, less what they "
+            f"share) in {path}."
         )
         result = loop.run(
             program.init(),
             program.chunk,
             directory,
-            loop.Rhythm(base.num_updates, base.loop.evaluate_every, base.loop.checkpoint_every),
+            loop.Rhythm(base.num_updates, base.loop.chunk_updates, base.loop.checkpoint_every),
             loop.Display(
                 f"sweep of {len(configs)}",
                 work_per_step=base.ppo.steps_per_update * len(configs),
             ),
             may_be_nan=("*",),  # One diverged member does not end the others.
         )
-        rows = () if result.was_interrupted else write_members(directory, program, result.state)
-    return Runs(path, rows, task)
+        if result.was_interrupted:
+            return Runs(path, (), task)
+        write_members(directory, program, result.state)
+    return Runs.load(directory.path, task)
+
+
+def _digest(members: Sequence[Mapping[str, Any]]) -> str:
+    """Eight letters that other members would not have."""
+    return hashlib.sha256(json.dumps(members, sort_keys=True).encode()).hexdigest()[:8]
 
 
 def checked_seeds(seeds: Iterable[int]) -> list[int]:
@@ -343,10 +313,10 @@ def member_configs(
     """
     legal = [field.name for field in fields(Hyperparameters)]
     for name, values in vary.items():
-        if name not in legal or not len(values):
+        if name not in legal or not len(values) or len({*values}) != len(values):
             raise UsageError(
-                f"Cannot vary {name} over {list(values)}: give at least one value for a "
-                f"hyper-parameter of {', '.join(legal)}."
+                f"Cannot vary {name} over {list(values)}: give at least one value, each once, for "
+                f"a hyper-parameter of {', '.join(legal)}."
             )
     combinations = itertools.product(*vary.values())
     return [
@@ -363,18 +333,29 @@ def member_configs(
     ]
 
 
-def write_members(
-    directory: RunDirectory, program: SweepProgram, state: SweepState
-) -> tuple[dict[str, Any], ...]:
-    """Writes one run directory per member; returns a row for each, see `Runs`.
+def member_names(configs: Sequence[TrainConfig]) -> list[str]:
+    """What tells members apart, as names of folders: `entropy_coefficient=0.01-seed=31`."""
+    numbers = [plain(config.hyperparameters) for config in configs]
+    varied = [name for name in numbers[0] if len({of[name] for of in numbers}) > 1]
+    return [
+        "-".join([*(f"{name}={of[name]!r}" for name in varied), f"seed={config.seed}"])
+        for config, of in zip(configs, numbers, strict=True)
+    ]
+
+
+def write_members(directory: RunDirectory, program: SweepProgram, state: SweepState) -> None:
+    """Writes one run directory per member, and a row for each, see `Runs`.
 
     All appear at once, when all are whole; members that are there are left alone.
     """
     lines = read(directory.path / "metrics.jsonl")
-    partial, members = directory.path / "members.partial", directory.path / "members"
+    partial, members = directory.path / f"{MEMBERS}.partial", directory.path / MEMBERS
+    names = member_names(program.configs)
+    if (members / "000").exists():  # Until 0.2.0 they were numbered.
+        names = [f"{index:03d}" for index in range(len(names))]
     rows = []
-    for index, config in enumerate(program.configs):
-        path = members / f"{index:03d}"
+    for index, (name, config) in enumerate(zip(names, program.configs, strict=True)):
+        path = members / name
         best, latest = (
             jax.tree.map(lambda x, i=index: x[i], tree) for tree in (state.best, state.members)
         )
@@ -387,7 +368,7 @@ def write_members(
         }
         if not members.exists():
             trainer = replace(program.trainer, config=config)
-            with open_run(partial / path.name, trainer, overwrite=True) as member:
+            with open_run(partial / name, trainer, overwrite=True) as member:
                 write_metrics(member, lines, f"{index:03d}/")
                 checkpointer = Checkpointer(member.checkpoints)
                 if has_best:
@@ -397,8 +378,7 @@ def write_members(
         rows.append({"path": str(path), "seed": config.seed, **metadata, **numbers})
     if not members.exists():
         partial.rename(members)
-    directory.record_evaluation("members", {"members": rows})
-    return tuple(rows)
+    directory.record_evaluation(MEMBERS, {MEMBERS: rows})
 
 
 def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str) -> None:

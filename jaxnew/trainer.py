@@ -200,6 +200,7 @@ def rollout_of(
       seed: of environments on the host.
       num_workers: processes for them; 0 for one per core.
     """
+    task.check_workers(num_workers)
     if task.host is not None:
         environments = task.host.environments(
             config.rollout.num_envs, seed, num_workers, task.environment

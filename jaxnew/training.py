@@ -11,13 +11,13 @@ import jax
 
 from jaxnew import loop
 from jaxnew.actions import ActionSplit, check_same
-from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table
+from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table, is_learned
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run, load_trainer, locate
 from jaxnew.storage.config import Assignments
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.budgets import StageTwoBudget
+from jaxnew.task.budgets import StageTwoBudget, foretold
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import adapted, file_name, variant_of
 from jaxnew.task.places import UsageError
@@ -76,7 +76,7 @@ def train(
     task = load_task(task) if isinstance(task, str) else task
     domain, runs = Domain.of(task, split, split_seed), Path(runs)
     variant_of(method)  # Before a representation is trained for it.
-    name, found = named_table(domain, runs, table, representation_budget or budget)
+    name, found = named_table(domain, runs, table, budget, representation_budget)
     preset = task.budget(budget)
     config = with_set(train_config(domain, method, name, found, preset, seed), set)
     title = f"{file_name(method)}-{Path(name).name.removesuffix('.npz')}"
@@ -86,7 +86,8 @@ def train(
         Trainer.of(config, task, domain.split, found, num_workers) as trainer,
         open_run(path, trainer, overwrite) as directory,
     ):
-        print(f"Training {title}: {config.num_updates} updates ({preset.cost}) in {path}.")
+        cost = foretold(preset, config)
+        print(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
         result = run_updates(trainer, trainer.init(), directory, title, is_evaluated=True)
     if result.best_metric is not None:
         print(
@@ -145,14 +146,27 @@ def finetune(
 
 
 def named_table(
-    domain: Domain, runs: Path, table: RepresentationTable | str | Path, budget: str
+    domain: Domain,
+    runs: Path,
+    table: RepresentationTable | str | Path,
+    budget: str,
+    own_budget: str | None,
 ) -> tuple[str, RepresentationTable]:
-    """What a run calls its representation, and the table, made now if it has to be."""
+    """What a run calls its representation, and the table, made now if it has to be.
+
+    Raises:
+      UsageError: it has a budget of its own, and nothing is trained for it.
+    """
+    if own_budget and (isinstance(table, RepresentationTable) or not is_learned(str(table))):
+        raise UsageError(
+            f"representation_budget={own_budget}: nothing is trained for the representation that "
+            "was given; leave it out."
+        )
     if isinstance(table, RepresentationTable):
         table.check(domain.universe, domain.split)
         name = table.source.partition(",")[0].removeprefix("engineered:")
         return name.replace(":", "-").strip(), table
-    return str(table), find_table(domain, runs, str(table), budget)
+    return str(table), find_table(domain, runs, str(table), own_budget or budget)
 
 
 def train_config(

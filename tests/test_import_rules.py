@@ -27,7 +27,7 @@ LAYERS = (
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
-    {"recording", "embedding", "trainer", "new_actions", "run", "training", "sweeping"},
+    {"recording", "embedding", "trainer", "new_actions", "run", "runs", "training", "sweeping"},
 )
 SIDEWAYS = {
     "observations": {"actions", "storage"},
@@ -37,7 +37,8 @@ SIDEWAYS = {
     "new_actions": {"trainer"},
     "run": {"embedding", "new_actions", "trainer"},
     "training": {"embedding", "run", "trainer"},
-    "sweeping": {"run", "trainer", "training"},
+    "runs": {"run"},
+    "sweeping": {"run", "runs", "trainer", "training"},
 }
 
 # Of `experiments`, lowest first; commands and benchmarks are above them.

@@ -1,1 +1,1 @@
-"""From run directories to figures and tables with the paper's numbers beside ours."""
+"""From run directories to figures and tables with the paper's numbers beside them."""

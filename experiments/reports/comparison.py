@@ -1,4 +1,4 @@
-"""Our learning curves against the paper's at equal environment steps."""
+"""Learning curves of jaxnew against the paper's at equal environment steps."""
 
 from __future__ import annotations
 
@@ -25,13 +25,13 @@ class CurvePoint:
       setting: label of the group.
       split: sets of `train` or `validation` actions.
       steps: environment steps of our evaluation.
-      mean, std: ours, every seed held at its best evaluation as the paper draws them; population
-        deviation over seeds.
-      num_seeds: ours.
+      mean, std: jaxnew's, every seed held at its best evaluation as the paper draws them;
+        population deviation over seeds.
+      num_seeds: jaxnew's.
       paper_mean, paper_std: of the paper's curve, linear between its points; None before its first
         one or without a curve.
       verdict: `on` where the two means differ by at most the root of the summed variances, else
-        `above` or `below` (ours against the paper's); None without a paper's value, or with one
+        `above` or `below` (jaxnew against the paper); None without a paper's value, or with one
         that nothing can be compared with.
     """
 
@@ -58,11 +58,11 @@ def compare_curves(groups: Sequence[Group]) -> list[CurvePoint]:
             steps, mean, std = mean_curve([run.held_at_best() for run in runs])
             for share in _SHARES:
                 index = int(np.argmin(np.abs(steps - share * steps[-1])))
-                ours = float(mean[index]), float(std[index])
+                own = float(mean[index]), float(std[index])
                 paper = _paper_at(group, split, steps[index])
-                verdict = verdict_of(*ours, *paper) if is_fair else None
+                verdict = verdict_of(*own, *paper) if is_fair else None
                 at = group.label, split, float(steps[index])
-                points.append(CurvePoint(*at, *ours, len(runs), *paper, verdict))
+                points.append(CurvePoint(*at, *own, len(runs), *paper, verdict))
     return points
 
 
@@ -98,13 +98,13 @@ def comparison_markdown(
     """The points for reading, and a note below them."""
     rows = []
     for point in points:
-        ours = f"{metric.text(point.mean)} ± {metric.text(point.std)} ({point.num_seeds} seeds)"
+        own = f"{metric.text(point.mean)} ± {metric.text(point.std)} ({point.num_seeds} seeds)"
         paper = "-"
         if point.paper_mean is not None and point.paper_std is not None:
             paper = f"{metric.text(point.paper_mean)} ± {metric.text(point.paper_std)}"
-        cells = [point.setting, point.split, f"{point.steps * 1e-6:.2f}", ours, paper]
+        cells = [point.setting, point.split, f"{point.steps * 1e-6:.2f}", own, paper]
         rows.append([*cells, point.verdict or "-"])
-    header = ["setting", "sets", "steps (million)", "ours", "paper", "ours is"]
+    header = ["setting", "sets", "steps (million)", "jaxnew", "paper", "jaxnew is"]
     lines = [
         *(f"# {title}", "", *tables.table(header, rows), ""),
         f"{metric.name}; every seed held at its best evaluation so far, as the paper draws its "

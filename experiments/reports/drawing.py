@@ -1,4 +1,4 @@
-"""The figures of groups of runs, the paper's numbers beside ours."""
+"""The figures of groups of runs, the paper's numbers beside them."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def bars_figure(
         by_split = standard_rows(rows[group.label])
         if "test" not in by_split:
             continue
-        ours = {split: Bar(row.mean, row.low, row.high) for split, row in by_split.items()}
+        own = {split: Bar(row.mean, row.low, row.high) for split, row in by_split.items()}
         paper = {
             split: Bar(
                 row.paper_mean, row.paper_mean - row.paper_std, row.paper_mean + row.paper_std
@@ -114,9 +114,9 @@ def bars_figure(
             _note([row.num_seeds for row in by_split.values()], test.trained_steps),
             _note(paper_seeds, test.paper_steps) if paper else "",
         )
-        settings.append(BarSetting(group.label, color, ours, paper, *notes, lines_of(group)))
+        settings.append(BarSetting(group.label, color, own, paper, *notes, lines_of(group)))
         episodes = f" ({test.num_episodes:,} episodes a bar)" if test.num_seeds == 1 else ""
-        errors.append(f"ours, {test.error}{episodes}")
+        errors.append(f"jaxnew, {test.error}{episodes}")
     if not settings:
         return None
     if any(setting.paper for setting in settings):
@@ -166,16 +166,21 @@ def tsne_figure(run: RunRecord, part: str) -> Figure | None:
     """Representations of one part of the split, by class; None if it has too few actions."""
     if run.table is None or run.split is None:
         return None
-    config = run.config
-    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
-    domain = replace(domain, split=run.split)
-    panel = tsne_panel(domain, run.table, part, int(config["seed"]))
+    domain = domain_of(run)
+    panel = tsne_panel(domain, run.table, part, int(run.config["seed"]))
     if panel is None:
         print(f"{run.path}: too few actions for a picture of part {part!r}.")
         return None
     name = {"heldout": "held-out"}.get(part, part)
     title = f"{run.representation}: {name} actions"
     return plots.tsne_scatter([panel], domain.universe.class_names, title)
+
+
+def domain_of(run: RunRecord) -> Domain:
+    """The domain of a run, with the split that the run kept."""
+    config = run.config
+    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
+    return replace(domain, split=run.split or domain.split)
 
 
 def tsne_panel(

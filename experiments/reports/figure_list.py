@@ -111,7 +111,7 @@ FIGURES: dict[str, PaperFigure] = {
         },
         notes={
             _STACKING: f"{_STACKING_NOTE} Its engineered vectors had their classes in an order "
-            "that changed from process to process; ours do not."
+            "that changed from process to process; those of jaxnew do not."
         },
     ),
     "8": PaperFigure(
@@ -156,8 +156,8 @@ FIGURES: dict[str, PaperFigure] = {
         "bars",
         "no reward for subgoals",
         _each(_CREATE, (_OURS, Cell("ours", "hvae", variant="-no-subgoals"))),
-        note="Ours is paid for the goal only; the release does not record which rewards the "
-        "paper's runs lacked.",
+        note="In jaxnew it is paid for the goal only; the release does not record which rewards "
+        "the paper's runs lacked.",
     ),
     "21": PaperFigure(
         "bars",
@@ -189,7 +189,8 @@ FIGURES: dict[str, PaperFigure] = {
         _everywhere(_ALL, "vae"),
         notes={
             _STACKING: "The paper's train curves of methods with one fixed set come from another "
-            "simulator, which rebuilds the scene at each drop; ours are not compared with them."
+            "simulator, which rebuilds the scene at each drop; those of jaxnew are not compared "
+            "with them."
         },
     ),
 }

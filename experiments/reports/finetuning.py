@@ -114,7 +114,7 @@ def make_finetuned(tuning: Tuning, groups: Sequence[Group], num_episodes: int) -
 
 
 def zero_shot(source: Source, group: Group, num_episodes: int) -> dict[str, float]:
-    """On sets as in training, and on all test actions at once; ours and the paper's."""
+    """On sets as in training, and on all test actions at once; jaxnew's and the paper's."""
     domain, usual = source.domain, group.standard("test")
     whole = len(trained_ids("no-subsampling", domain.task, domain.split, "test"))
     whole += len(domain.split.always_available)
@@ -125,7 +125,7 @@ def zero_shot(source: Source, group: Group, num_episodes: int) -> dict[str, floa
     references = {}
     for number, (name, question) in enumerate(questions.items()):
         means = [r[number]["metrics"][group.task.selection_metric]["mean"] for r in rows]
-        references[f"ours, zero-shot, {name} ({question.set_size})"] = float(np.mean(means))
+        references[f"jaxnew, zero-shot, {name} ({question.set_size})"] = float(np.mean(means))
         if group.paper_environment is not None:
             paper = paper_value(group.paper_environment, published[number], "test")
             if paper is not None:

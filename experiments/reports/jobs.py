@@ -20,7 +20,7 @@ from experiments.reports.plots import amount
 from experiments.reports.production import Cell, Source
 from experiments.reports.runs import read_runs
 from jaxnew.cores import available_cores
-from jaxnew.embedding import TABLE_FILE
+from jaxnew.embedding import TABLE_FILE, is_learned
 from jaxnew.recording import parse_representation
 from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.methods import file_name
@@ -89,8 +89,7 @@ class Job:
 def embed_job(source: Source, representation: str) -> Job | None:
     """What makes a representation; None if there is nothing to make."""
     domain = source.domain
-    is_learned = representation.startswith(("hvae", "vae"))
-    if not is_learned or representation in source.given:
+    if not is_learned(representation) or representation in source.given:
         return None
     folder = source.embed_folder(representation)
     if (folder / TABLE_FILE).exists():
@@ -172,12 +171,13 @@ def sweep_job(
 
 def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
     """Flags of `train` and `sweep` that say what is trained."""
+    table = str(source.given.get(cell.representation, cell.representation))
     return (
         f"--task={source.domain.task.reference}",
         *_split_flags(source),
         f"--method={cell.method}",
-        f"--representation={source.given.get(cell.representation, cell.representation)}",
-        f"--representation_budget={source.stage_one}",
+        f"--representation={table}",
+        *([f"--representation_budget={source.stage_one}"] if is_learned(table) else []),
         f"--budget={source.budget}",
         f"--runs={source.folder}",
     )

@@ -14,6 +14,7 @@ from experiments.reports.drawing import (
     BAR_SPLITS,
     bars_figure,
     curves_figure,
+    domain_of,
     representations_figure,
 )
 from experiments.reports.figure_list import FIGURES, PaperFigure, number_of
@@ -22,16 +23,24 @@ from experiments.reports.finetuning import Tuning, finetune_figure, make_finetun
 from experiments.reports.jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
 from experiments.reports.production import Cell, Source, find
 from experiments.reports.results import as_csv, as_markdown, result_rows
-from experiments.reports.runs import Group, RunRecord
+from experiments.reports.runs import (
+    Group,
+    RunRecord,
+    group_runs,
+    read_runs,
+    with_distinct_labels,
+)
 from experiments.reports.studies import kind_of, study_runs
 from experiments.reports.study_report import write_study
 from jaxnew.embedding import TABLE_FILE, find_table
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Question
-from jaxnew.task.domain import Domain
+from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
+from jaxnew.task.task import Task
 
 Setting = tuple[Source, Cell]  # A cell, and where its runs come from.
+ADDED_TO = ("bars", "curves", "representations", "study")
 
 
 @dataclass(frozen=True)
@@ -43,12 +52,14 @@ class Options:
       finetune_steps: environment steps of fine-tuning; 0 for the preset's share.
       has_pdf: every figure is written as PDF, too.
       films: of figure 8.
+      added: runs and sweeps that figures of the kinds `ADDED_TO` show as well.
     """
 
     episodes: int = 5000
     finetune_steps: float = 0.0
     has_pdf: bool = False
     films: FilmOptions = field(default_factory=FilmOptions)
+    added: tuple[Path, ...] = ()
 
 
 def make(
@@ -76,7 +87,8 @@ def make(
     jobs, episodes, tuned = [], 0, []
     for number, settings in work.items():
         jobs += missing_jobs(FIGURES[number], settings)
-        episodes += missing_episodes(FIGURES[number], settings, options.episodes)
+        added = added_to(FIGURES[number], settings, options.added)
+        episodes += missing_episodes(FIGURES[number], settings, options.episodes, added)
         if FIGURES[number].kind == "finetune":
             tuned.append(Tuning(settings[0][0], options.finetune_steps).seconds)
     jobs = unique_jobs(jobs)
@@ -135,11 +147,19 @@ def unique_jobs(jobs: Sequence[Job]) -> list[Job]:
     return list({job.command: job for job in jobs}.values())
 
 
-def missing_episodes(figure: PaperFigure, settings: Sequence[Setting], num_episodes: int) -> int:
+def missing_episodes(
+    figure: PaperFigure,
+    settings: Sequence[Setting],
+    num_episodes: int,
+    added: Sequence[RunRecord] = (),
+) -> int:
     """Episodes of the evaluations that the figure still needs, also of runs yet to be made."""
     if figure.kind not in ("bars", "study"):
         return 0
     missing = 0
+    for group in group_runs(added):
+        for run in group.runs:
+            missing += len(lacking(run, questions_of(figure, group), num_episodes))
     for source, cell in settings:
         task, found = source.domain.task, find(source, cell)
         per_run = len(
@@ -170,9 +190,12 @@ def draw(number: str, settings: Sequence[Setting], out: Path, options: Options) 
     figure, name, (first, _) = FIGURES[number], f"figure_{number}", settings[0]
     if figure.kind == "representations":
         panels = representation_panels(settings)
+        for run in added_to(figure, settings, options.added):
+            if run.table is not None:
+                panels[f"{run.representation}, {run.path.name}"] = domain_of(run), run.table
         picture = representations_figure(panels, f"Figure {number}: {figure.title}")
         return plots.save(picture, out / f"{name}.png", options.has_pdf)
-    groups = [group_of(source, cell) for source, cell in settings]
+    groups = groups_of(figure, settings, options.added)
     title = f"Figure {number}, {groups[0].place}: {figure.title}"
     note = figure.notes.get(first.domain.task.name, figure.note)
     if figure.kind == "films":
@@ -192,7 +215,7 @@ def draw(number: str, settings: Sequence[Setting], out: Path, options: Options) 
         asked = [Asked.part(question) for question in questions_of(figure, group)]
         for run in group.runs:
             answers_of(run, asked, options.episodes, first.workers)
-    groups = [group_of(source, cell) for source, cell in settings]
+    groups = groups_of(figure, settings, options.added)  # With what is on record now.
     rows = {g.label: [r for r in result_rows(g) if r.is_standard] for g in groups}
     drawn = bars_figure(groups, rows, title)
     files = plots.save(drawn, out / f"{name}.png", options.has_pdf) if drawn else []
@@ -200,6 +223,46 @@ def draw(number: str, settings: Sequence[Setting], out: Path, options: Options) 
     notes = [*([note] if note else []), *notes_of(groups)]
     text = as_markdown(title, flat, groups[0].metric, notes)
     return files + tables.write(out, name, text, as_csv(flat))
+
+
+def added_to(
+    figure: PaperFigure, settings: Sequence[Setting], paths: Sequence[Path]
+) -> list[RunRecord]:
+    """The runs that a figure shows beside its settings; none where its kind takes none.
+
+    Raises:
+      UsageError: one is of another task or other actions than the figure, is no run of a policy
+        where policies are shown, or is not finished.
+    """
+    if not paths or figure.kind not in ADDED_TO:
+        return []
+    shows_policies = figure.kind != "representations"
+
+    def shown_as(task: Task) -> str:
+        own = None if shows_policies else task.actions_name
+        return own or task.reference
+
+    names = {shown_as(source.domain.task) for source, _ in settings}
+    runs = read_runs(paths)
+    for run in runs:
+        name = shown_as(load_task(run.config["task"]))
+        if name not in names:
+            raise UsageError(
+                f"{run.path} is a run of {name}; the figure shows {', '.join(sorted(names))}."
+            )
+        if shows_policies and not run.is_policy:
+            raise UsageError(f"{run.path} is a run of embed; train a policy on it, and add that.")
+        if run.table is None or (shows_policies and not run.is_finished):
+            raise UsageError(f"{run.path} is not finished; call its command again to go on.")
+    return runs
+
+
+def groups_of(
+    figure: PaperFigure, settings: Sequence[Setting], added: Sequence[Path]
+) -> list[Group]:
+    """The runs of a figure's settings, and those that are added, each under a label of its own."""
+    groups = [group_of(source, cell) for source, cell in settings]
+    return with_distinct_labels([*groups, *group_runs(added_to(figure, settings, added))])
 
 
 def representation_panels(

@@ -90,21 +90,21 @@ class Bar:
 
 @dataclass(frozen=True)
 class BarSetting:
-    """Bars of one setting: ours and, beside it, the paper's.
+    """Bars of one setting: jaxnew's and, beside it, the paper's.
 
     Attributes:
       label: of the setting.
       color: of our bars.
-      ours, paper: by split, `train` and `test`; either may be absent.
-      ours_note, paper_note: below the bars, such as `5 seeds`.
+      own, paper: by split, `train` and `test`; either may be absent.
+      own_note, paper_note: below the bars, such as `5 seeds`.
       anchors: what policies without training reach on test actions, by name: lines across.
     """
 
     label: str
     color: Color
-    ours: Mapping[str, Bar]
+    own: Mapping[str, Bar]
     paper: Mapping[str, Bar]
-    ours_note: str = ""
+    own_note: str = ""
     paper_note: str = ""
     anchors: Mapping[str, float] = field(default_factory=dict)
 
@@ -117,7 +117,7 @@ def hls_palette(n: int, l: float = 0.6, s: float = 0.9, h: float = 0.7) -> list[
 def bars(
     settings: Sequence[BarSetting], metric: Metric, title: str = "", footnote: str = ""
 ) -> Figure:
-    """Test actions in front (hatched), train actions behind (pale); ours beside the paper's.
+    """Test actions in front (hatched), train actions behind (pale); jaxnew's beside the paper's.
 
     Args:
       settings: at least one.
@@ -128,12 +128,12 @@ def bars(
     figure = new_figure(max(4.4, 1.6 + 2.1 * len(settings)), 4.2)
     axes = figure.subplots()
     ticks: list[tuple[float, str]] = []
-    num_lines = 1 + max(max(s.ours_note.count("\n"), s.paper_note.count("\n")) for s in settings)
+    num_lines = 1 + max(max(s.own_note.count("\n"), s.paper_note.count("\n")) for s in settings)
     end = _axis_end(settings, metric)
     dashes = _anchor_dashes(settings)
     for position, setting in enumerate(settings):
         sides: list[tuple[str, Mapping[str, Bar], Color | str, str]] = [
-            ("ours", setting.ours, setting.color, setting.ours_note)
+            ("jaxnew", setting.own, setting.color, setting.own_note)
         ]
         if setting.paper:
             sides.append(("paper", setting.paper, PAPER_COLOR, setting.paper_note))
@@ -192,7 +192,7 @@ def _axis_end(settings: Sequence[BarSetting], metric: Metric) -> float:
     bars = [
         bar
         for setting in settings
-        for by_split in (setting.ours, setting.paper)
+        for by_split in (setting.own, setting.paper)
         for split, bar in by_split.items()
         if split == "test" or not metric.cuts_train
     ]

@@ -94,8 +94,10 @@ class Source:
     @classmethod
     def asked_for(cls, flags: Any, given: Mapping[str, Path] | None = None) -> Source:
         """What the flags of a command say; `flags` are its `Arguments`."""
+        domain = Domain.of(load_task(flags.task), flags.split, flags.split_seed)
+        domain.task.check_workers(flags.workers)
         return cls(
-            domain=Domain.of(load_task(flags.task), flags.split, flags.split_seed),
+            domain=domain,
             folder=Path(flags.runs),
             budget=flags.budget,
             stage_one=flags.representation_budget or flags.budget,

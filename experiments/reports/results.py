@@ -29,15 +29,15 @@ class ResultRow:
       is_standard: evaluated as the paper does: sampled actions of the checkpoint that was chosen by
         validation, on sets of the paper's size.
       metric: the episode metric.
-      mean: ours; over seeds if there are several.
+      mean: jaxnew's; over seeds if there are several.
       low, high: ends of its error bar.
       error: what the error bar is.
-      num_seeds, num_episodes: ours; episodes per seed.
+      num_seeds, num_episodes: jaxnew's; episodes per seed.
       checkpoint_steps, trained_steps: environment steps of the evaluated checkpoint and of the
         run; means over the seeds.
       paper_method, paper_mean, paper_std, paper_num_seeds, paper_steps: the paper's number, None
         where it has none for this setting.
-      difference: ours minus the paper's, in points (hundredths) for shares, else plain.
+      difference: jaxnew's minus the paper's, in points (hundredths) for shares, else plain.
       runs: the directories.
     """
 
@@ -157,18 +157,18 @@ def as_csv(rows: Sequence[ResultRow]) -> str:
 
 def as_markdown(title: str, rows: Sequence[ResultRow], metric: Metric, notes: Sequence[str]) -> str:
     """The rows for reading, and what their numbers are."""
-    header = ["setting", "actions", "policy", "ours", "paper", "difference", "seeds"]
+    header = ["setting", "actions", "policy", "jaxnew", "paper", "difference", "seeds"]
     header += ["episodes", "steps (million)", "run"]
     points = ", in percentage points" if metric.unit == "%" else ""
     lines = [
         *(f"# {title}: {metric.name.lower()}", ""),
         *tables.table(header, [_cells(row, metric) for row in rows]),
         "",
-        "Ours: [low, high] is the 95 % interval over the episodes of one run; ± is the population "
-        "standard deviation over seeds, as in the paper, whose numbers are 5,000 sampled episodes "
-        "per seed. Seeds and steps: ours / the paper's; episodes are per seed. Steps are those "
-        "that a run was trained for; the checkpoint is the best one by validation."
-        f" Difference: ours minus the paper's{points}.",
+        "jaxnew: [low, high] is the 95 % interval over the episodes of one run; ± is the "
+        "population standard deviation over seeds, as in the paper, whose numbers are 5,000 "
+        "sampled episodes per seed. Seeds and steps: jaxnew's / the paper's; episodes are per "
+        "seed. Steps are those that a run was trained for; the checkpoint is the best one by "
+        f"validation. Difference: jaxnew's minus the paper's{points}.",
         *(f"\n{note}" for note in notes),
     ]
     return "\n".join(lines) + "\n"

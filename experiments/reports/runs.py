@@ -25,6 +25,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Question
+from jaxnew.runs import is_sweep
 from jaxnew.storage.config import differences, plain
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import RunDirectory
@@ -232,7 +233,7 @@ def read_runs(paths: Sequence[Path]) -> list[RunRecord]:
 
 def _members(path: Path) -> list[Path]:
     """The member directories of a sweep; none of another run."""
-    if "members" not in RunDirectory.load(path).config:
+    if not is_sweep(RunDirectory.load(path)):
         return []
     members = sorted(p.parent for p in path.glob("members/*/config.json"))
     if not members:
@@ -288,10 +289,10 @@ def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
         first = members[0]
         label = f"{first.config['method']}, {first.representation}"
         groups.append(Group(label, load_task(first.config["task"]), tuple(members)))
-    return _with_distinct_labels(groups)
+    return with_distinct_labels(groups)
 
 
-def _with_distinct_labels(groups: list[Group]) -> list[Group]:
+def with_distinct_labels(groups: list[Group]) -> list[Group]:
     """The groups; those of one label get values in which they differ appended to it."""
     labelled: list[Group] = []
     for group in groups:

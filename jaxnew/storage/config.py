@@ -310,7 +310,8 @@ def differences(old: Any, new: Any, path: str = "") -> list[Difference]:
     """`(path, old value, new value)` of each field in which two configurations differ.
 
     Either side is a configuration or its plain form; a field of one side only is `ABSENT` in the
-    other.
+    other. Of lists of configurations, such as those of a sweep's members, it is the distinct values
+    of a field that differ.
     """
     old = to_dict(old) if dataclasses.is_dataclass(old) else old
     new = to_dict(new) if dataclasses.is_dataclass(new) else new
@@ -322,5 +323,32 @@ def differences(old: Any, new: Any, path: str = "") -> list[Difference]:
         return found
     old = list(old) if isinstance(old, tuple) else old
     new = list(new) if isinstance(new, tuple) else new
+    if _are_groups(old) and _are_groups(new) and old != new:
+        pair = _values(old), _values(new)
+        return differences(*pair, path) or [(path, "the same values", "in another order")]
     is_same = old == new and isinstance(old, bool) == isinstance(new, bool)
     return [] if is_same else [(path, old, new)]
+
+
+def _are_groups(value: Any) -> bool:
+    """Whether a value is a list of configurations."""
+    return isinstance(value, list) and bool(value) and isinstance(value[0], Mapping)
+
+
+def _values(configs: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """By path, the value that all configurations have, or the list of their distinct ones."""
+    found: dict[str, list[Any]] = {}
+    for config in configs:
+        for path, value in _leaves(config):
+            of_path = found.setdefault(path, [])
+            of_path += [value] * (value not in of_path)
+    return {path: values[0] if len(values) == 1 else values for path, values in found.items()}
+
+
+def _leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Path and value of every field of a plain configuration that is no group."""
+    if isinstance(value, Mapping):
+        for name in value:
+            yield from _leaves(value[name], _join(path, str(name)))
+    else:
+        yield path, value

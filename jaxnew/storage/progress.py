@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from typing import Any, Self
 
 _PLAIN_EVERY_S = 10.0
+_MOVES_EVERY_S = 1.0
 
 
 def _rich_bar() -> Any | None:
     """A rich progress bar if rich is installed and the output is a terminal, else None."""
     try:
         from rich.console import Console
-        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+        from rich.progress import (
+            BarColumn,
+            Progress,
+            TextColumn,
+            TimeRemainingColumn,
+        )
     except ImportError:
         return None
     console = Console()
@@ -38,6 +45,9 @@ def duration(seconds: float) -> str:
 class ProgressDisplay:
     """Shows how far a job is. A context manager; `update` may be called as often as wanted.
 
+    Between two calls it moves by itself, at the rate so far and no further than the last call moved
+    it, and says `about`.
+
     Args:
       title: what runs.
       total: the number of steps at the end.
@@ -48,6 +58,10 @@ class ProgressDisplay:
     def __init__(self, title: str, total: int, unit: str, start: int = 0) -> None:
         self._title, self._total, self._unit = title, total, unit
         self._mark = (start, time.monotonic())
+        self._now = self._mark  # Of the last update.
+        self._step, self._note = 0, ""
+        self._has_ended = threading.Event()
+        self._mover = threading.Thread(target=self._move, daemon=True)
         self._last_line_s = float("-inf")
         self._bar = _rich_bar()
         self._task = (
@@ -59,11 +73,30 @@ class ProgressDisplay:
     def __enter__(self) -> Self:
         if self._bar is not None:
             self._bar.start()
+        self._mover.start()
         return self
 
     def __exit__(self, *error: object) -> None:
+        self._has_ended.set()
+        self._mover.join()
         if self._bar is not None:
             self._bar.stop()
+
+    def _move(self) -> None:
+        while not self._has_ended.wait(_MOVES_EVERY_S):
+            done, since = self._now
+            waited = time.monotonic() - since
+            if self._rate:
+                moved = min(self._rate * waited, 0.99 * self._step)
+                self._show(done + moved, self._note, "about ")
+            else:
+                self._show(done, f"{self._note} for {duration(waited)}")
+
+    @property
+    def _rate(self) -> float:
+        """Steps per second up to the last update; 0 before there is one."""
+        (start, since), (done, now) = self._mark, self._now
+        return (done - start) / (now - since) if now > since else 0.0
 
     def restart_clock(self, done: int) -> None:
         """Leaves what was done so far, such as compilation, out of the time-left estimate."""
@@ -78,6 +111,11 @@ class ProgressDisplay:
 
     def update(self, done: int, note: str = "") -> None:
         """Moves to `done` steps, with a short note such as key metrics."""
+        self._step, self._note = done - self._now[0] or self._step, note
+        self._now = (done, time.monotonic())
+        self._show(done, note)
+
+    def _show(self, done: float, note: str, about: str = "") -> None:
         if self._bar is not None:
             self._bar.update(self._task, completed=done, note=note)
             return
@@ -85,10 +123,7 @@ class ProgressDisplay:
         if now - self._last_line_s < _PLAIN_EVERY_S and done < self._total:
             return
         self._last_line_s = now
-        start, since = self._mark
-        rate = (done - start) / (now - since) if now > since else 0.0
+        rate = self._rate
         left = f", {duration((self._total - done) / rate)} left" if rate > 0 else ""
-        print(
-            f"{self._title}: {done}/{self._total} {self._unit}{left}{'  ' + note if note else ''}",
-            flush=True,
-        )
+        where = f"{about}{int(done)}/{self._total} {self._unit}"
+        print(f"{self._title}: {where}{left}{'  ' + note if note else ''}", flush=True)

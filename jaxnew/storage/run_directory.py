@@ -16,6 +16,7 @@ import json
 import os
 import platform
 import re
+import reprlib
 import shutil
 import subprocess
 import sys
@@ -35,6 +36,10 @@ _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint", "muj
 _FOLDERS = ("tensorboard", "checkpoints", "figures", "evaluation")
 
 
+_SHORT = reprlib.Repr()  # Cuts groups of fields and long lists.
+_SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 16, 200, 200
+
+
 class RunDirectoryError(ValueError):
     """A path cannot be used as a run directory, or its files are damaged."""
 
@@ -52,7 +57,10 @@ class ConfigMismatch(RunDirectoryError):
 
     def __init__(self, path: Path, found: list[Difference]) -> None:
         self.differences = found
-        lines = [f"  {name}: {old!r} recorded, {new!r} asked for" for name, old, new in found]
+        lines = [
+            f"  {name}: {_SHORT.repr(old)} recorded, {_SHORT.repr(new)} asked for"
+            for name, old, new in found
+        ]
         super().__init__(
             f"{path} holds a run with another configuration:\n" + "\n".join(lines) + "\n"
             "Choose another --workdir to keep that run, or --overwrite to delete it and start anew."
@@ -77,7 +85,9 @@ def _read_json(path: Path) -> Any:
 def _read_object(path: Path) -> dict[str, Any]:
     content = _read_json(path)
     if not isinstance(content, dict):
-        raise RunDirectoryError(f"{path} is damaged: it must hold a JSON object, got {content!r}.")
+        raise RunDirectoryError(
+            f"{path} is damaged: it must hold a JSON object, got a {type(content).__name__}."
+        )
     return content
 
 

@@ -123,6 +123,19 @@ class StageTwoBudget:
         return config_lib.vary(self, changes)
 
 
+def foretold(preset: StageTwoBudget, config: Any) -> str:
+    """What a run of a preset takes, and how many times its steps a config (`TrainConfig`) has."""
+    usual = preset.num_updates * preset.ppo.steps_per_update
+    return scaled_cost(preset.cost, steps=config.num_updates * config.ppo.steps_per_update / usual)
+
+
+def scaled_cost(cost: str, **shares: float) -> str:
+    """A preset's cost, and what a run has more or less of: `scaled_cost("1 hour", steps=0.5)`."""
+    is_other = {what: abs(share - 1.0) > 0.01 for what, share in shares.items()}
+    words = [f"{share:.2g} of its {what}" for what, share in shares.items() if is_other[what]]
+    return f"{cost} for the preset; this has {' and '.join(words)}" if words else cost
+
+
 @dataclass(frozen=True)
 class Baselines:
     """Where the paper's baselines differ from domain to domain.

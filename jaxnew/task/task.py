@@ -266,6 +266,18 @@ class Task:
         """Name of the first split."""
         return next(iter(self.splits))
 
+    def check_workers(self, num_workers: int) -> None:
+        """Refuses processes for environments that take none.
+
+        Raises:
+          UsageError: there are some, and the environments run inside jit.
+        """
+        if num_workers and self.host is None:
+            raise UsageError(
+                f"num_workers={num_workers}: the environments of {self.name} run inside jit, not "
+                "in processes of their own; leave it out (--workers)."
+            )
+
     def budget(self, name: str) -> StageTwoBudget:
         """The preset of stage two called `name`.
 

@@ -163,7 +163,7 @@ def untrained(path: Path, place: str, representation: str, seed: int = 1) -> Pat
     budget = domain.task.budget("smoke")
     config = train_config(domain, "ours", representation, table, budget, seed)
     with (
-        Trainer.of(config, domain.task, domain.split, table, 1) as trainer,
+        Trainer.of(config, domain.task, domain.split, table) as trainer,
         open_run(path, trainer) as run,
     ):
         shapes = trainer.learner.policy_shapes(trainer.training)

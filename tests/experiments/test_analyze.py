@@ -85,6 +85,7 @@ def test_flags_of_the_other_kind_are_refused() -> None:
     for flags, message in (
         (["--study=entropy", "--run=a"], "--run: of no meaning for a search"),
         (["--study=set-size", "--steps=1"], "--steps: of no meaning for a study of runs"),
+        (["--study=set-size", "--run=a", "--encoder=b"], "--encoder: of no meaning for --study=se"),
         ([], "Say which: --study=set-size|unseen-ratio|"),
     ):
         analyze.ARGUMENTS.parse(flags)

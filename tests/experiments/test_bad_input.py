@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import shutil
 from pathlib import Path
@@ -16,6 +17,7 @@ from jaxnew.embedding import find_table
 from jaxnew.observations import ObservationsError
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.domain import Domain, load_task
+from jaxnew.task.places import UsageError
 from tests.experiments.commands import run
 from tests.experiments.several import refused
 
@@ -49,6 +51,8 @@ WRONG = {
     "--set=hyperparameters.clip=-1": ["clip=-1", "at least 0"],
     "--set=environment.max_moves=0": ["max_moves=0", "1"],
     "--set=table_hash=0": ["table_hash cannot be set"],
+    "--workers=2": ["num_workers=2", "inside jit", "--workers"],
+    "--representation_budget=smoke": ["representation_budget=smoke", "nothing is trained"],
     "--set=split=full": ["split cannot be set", "--split"],
     "--seed=4294967296": ["4294967296", "4294967295"],
     "--seed=-1": ["seed=-1", "0..4294967295"],
@@ -172,6 +176,24 @@ def test_bad_id_files(policy_run: Path, tmp_path: Path) -> None:
         jobs.append((f"--run={policy_run}", f"--ids={file}", "--episodes=8"))
     for says, output in zip(contents.values(), refused("evaluate", jobs), strict=True):
         assert says in output[-500:]
+
+
+def test_flags_of_another_mode_are_refused(policy_run: Path, tmp_path: Path) -> None:
+    """Nothing is ignored in silence."""
+    new = [f"--{name}={tmp_path}" for name in ("checkpoint", "observations", "output")]
+    cases: list[tuple[str, tuple[str, ...], str]] = [
+        ("evaluate", (f"--run={policy_run}", "--growth=2"), "--growth: of no meaning without"),
+        ("embed", (*new, "--seed=3", "--frames=stored"), "--seed, --frames: of no meaning with"),
+        ("embed", ("--budget=smoke", "--frames=stored"), "no drawn frames; leave out --frames"),
+        ("collect", ("--budget=smoke", "--frames=on-demand"), "no drawn frames"),
+    ]
+    for command, flags, says in cases:
+        arguments = importlib.import_module(f"experiments.{command}").ARGUMENTS
+        runs = () if command == "evaluate" or flags[:3] == tuple(new) else (f"--runs={tmp_path}",)
+        arguments.parse([*flags, *runs])
+        with pytest.raises(UsageError, match=says):
+            importlib.import_module(f"experiments.{command}").main()
+    assert not any(tmp_path.iterdir())
 
 
 def test_a_nan_stops_the_run_and_keeps_what_was_saved(runs: Path, tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import os
 import random
 import re
@@ -14,6 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from jaxnew import collection
 from jaxnew.representation.table import RepresentationTable
@@ -201,8 +203,8 @@ def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
     )
 
 
-def test_sweep_members_are_ordinary_runs(runs: Path) -> None:
-    run(
+def test_a_sweep_is_read_back_and_its_members_are_ordinary_runs(runs: Path) -> None:
+    output = run(
         "sweep",
         "--budget=smoke",
         "--representation=gt5",
@@ -210,15 +212,36 @@ def test_sweep_members_are_ordinary_runs(runs: Path) -> None:
         "--vary=entropy_coefficient=0.0,0.1",
         f"--runs={runs}",
     )
-    members = runs / "grid_world" / "sweep-ours-gt5" / "members"
-    configs = [read_json(members / f"{i:03d}" / "config.json") for i in range(4)]
-    found = {(c["seed"], c["hyperparameters"]["entropy_coefficient"]) for c in configs}
-    assert found == {(1, 0.0), (2, 0.0), (1, 0.1), (2, 0.1)}
-    run("evaluate", f"--run={members / '003'}", "--episodes=32")
-    assert (members / "003" / "evaluation" / "test-best-sampled-m50.json").is_file()
-    assert metrics.read(members / "003")[-1]["step"] == 4
-    summary = read_json(members.parent / "evaluation" / "members.json")["members"]
-    assert [row["seed"] for row in summary] == [1, 2, 1, 2]
+    (path,) = (runs / "grid_world").glob("sweep-ours-gt5-smoke-entropy_coefficient-*")
+    names = [f"entropy_coefficient={value}-seed={seed}" for value in (0.0, 0.1) for seed in (1, 2)]
+    assert sorted(member.name for member in (path / "members").iterdir()) == names
+    for name in names:
+        config = read_json(path / "members" / name / "config.json")
+        entropy, seed = config["hyperparameters"]["entropy_coefficient"], config["seed"]
+        assert name == f"entropy_coefficient={entropy}-seed={seed}"
+    last = path / "members" / names[3]
+    run("evaluate", f"--run={last}", "--episodes=32")
+    alone = last / "evaluation" / "test-best-sampled-m50.json"
+    before = read_json(alone)["metrics"]
+    # As `train` reports: a line per chunk of two updates.
+    assert [line["step"] for line in metrics.read(last) if "loss/total" in line] == [2, 4]
+    assert "| entropy_coefficient | validation/is_success | by validation |" in output
+    output = run("evaluate", f"--run={path}", "--sets=train,test", "--episodes=32")
+    header = "| entropy_coefficient | validation/is_success | test-best-sampled-m50 | train-best-"
+    assert header in output
+    assert read_json(alone)["metrics"] == before  # Alone and in turn.
+    with (path / "figures" / "sweep.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["entropy_coefficient"] for row in rows] == ["0.0", "0.1"]
+    for row, members in zip(rows, (names[:2], names[2:]), strict=True):
+        files = [path / "members" / m / "evaluation" / alone.name for m in members]
+        means = [read_json(file)["metrics"]["is_success"]["mean"] for file in files]
+        assert float(row["test-best-sampled-m50"]) == pytest.approx(np.mean(means))
+        assert row["test-best-sampled-m50_seeds"] == "2"
+    assert header in run("figures", f"--run={path}")
+    assert Image.open(path / "figures" / "sweep.png").size[0] > 500
+    output = run("evaluate", f"--run={path}", "--workers=1", fails=True)
+    assert "--workers: of no meaning for a sweep" in output
 
 
 def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:

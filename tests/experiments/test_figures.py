@@ -110,6 +110,24 @@ def test_command_asks_for_what_it_needs(tmp_path: Path) -> None:
         call("--figure=4", "--episode")
     with pytest.raises(UsageError, match="Unknown command line flag 'seed'"):
         call("--seed=1")
+    with pytest.raises(UsageError, match="--add: of no meaning without --figure"):
+        call(f"--run={one}", f"--add={other}")
+    task = "--task=create-push"
+    for flags, says in (
+        (("--figure=4", "--films=2"), "--films: of no meaning for figures of bars"),
+        (("--figure=4", "--finetune_steps=9"), "--finetune_steps: of no meaning for figures of b"),
+        (
+            ("--figure=5,8", task, "--episodes=9"),
+            "--episodes: .* figures of films, representations",
+        ),
+        (("--figure=8", task, "--pdf"), "--pdf: of no meaning for figures of films"),
+        (("--figure=8", task, f"--add={one}"), "--add: of no meaning for figures of films"),
+        (("--figure=5", task, "--seeds=1"), "--seeds: of no meaning for figures of represent"),
+        (("--figure=4", "--workers=2"), "environments of grid_world run inside jit"),
+        (("--figure=3",), "No figure '3'"),
+    ):
+        with pytest.raises(UsageError, match=says):
+            call(*flags, "--dry_run", f"--runs={tmp_path}")
 
 
 @pytest.mark.unit

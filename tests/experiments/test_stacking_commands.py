@@ -372,7 +372,7 @@ def test_members_of_a_sweep_share_their_batches(
     assert engine.batches == {(2, 2), (2, EPISODES)}
     split = published_split()
     assert engine.placed <= {*split.train.tolist(), *split.validation.tolist()}
-    members = [tmp_path / "sweep" / "members" / name for name in ("000", "001")]
+    members = [tmp_path / "sweep" / "members" / name for name in ("seed=31", "seed=41")]
     assert [read_json(path / "config.json")["seed"] for path in members] == [31, 41]
     assert read_json(members[0] / "config.json") == read_json(runs / "no-entropy" / "config.json")
     first, second = (logged(path, 1, "episode") for path in members)

@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
 import numpy as np
 import pytest
 
+from jaxnew import loop
 from jaxnew.ppo import Hyperparameters
 from jaxnew.representation.table import engineered_table
 from jaxnew.run import Run
+from jaxnew.runs import Runs
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import ConfigMismatch
-from jaxnew.sweeping import Runs, SweepProgram, checked_seeds, member_configs, sweep
+from jaxnew.sweeping import SweepProgram, checked_seeds, member_configs, sweep
 from jaxnew.task.domain import Domain
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import TrainConfig
@@ -65,6 +69,7 @@ def test_one_member_per_seed_and_combination(base: TrainConfig) -> None:
     [
         ({"entropy": [0.1]}, "Cannot vary entropy .* entropy_coefficient"),
         ({"clip": []}, r"Cannot vary clip over \[\]: give at least one value"),
+        ({"clip": [0.1, 0.1]}, r"Cannot vary clip over \[0.1, 0.1\]: .* each once"),
         ({"discount": [2.0]}, "discount=2.0 must be in"),
         ({"learning_rate": [-1.0]}, "learning_rate=-1.0 must be in"),
     ],
@@ -101,16 +106,17 @@ def test_devices_divide_the_members(
 @pytest.mark.integration
 def test_members_are_the_runs_that_they_stand_for(swept: Runs, tmp_path: Path) -> None:
     """Reloaded, with the metrics of `train` under the same names."""
-    assert swept.path.name == "sweep-ours-gt3"
+    assert swept.path.name.startswith("sweep-ours-gt3-smoke-entropy_coefficient-")
     assert swept.selection_metric == "validation/is_success"
     assert len(swept) == 4
     for run, row in zip(swept, swept.table(), strict=True):
         assert str(run.path) == row["path"]
-        number = int(run.path.name)
-        expected_seed, entropy = [3, 4, 3, 4][number], [0.01, 0.01, 0.5, 0.5][number]
-        assert (run.config.seed, row["seed"]) == (expected_seed, expected_seed)
+        seed, entropy = row["seed"], row["entropy_coefficient"]
+        assert run.path.name == f"entropy_coefficient={entropy}-seed={seed}"
+        assert run.config.seed == seed
         assert run.config.hyperparameters.entropy_coefficient == entropy
-        assert row["entropy_coefficient"] == entropy
+    found = [(row["entropy_coefficient"], row["seed"]) for row in swept.rows]
+    assert found == [(0.01, 3), (0.01, 4), (0.5, 3), (0.5, 4)]
     single = train(
         LADDER,
         TABLE,
@@ -165,8 +171,101 @@ def test_a_finished_sweep_is_left_alone(swept: Runs, capsys: pytest.CaptureFixtu
     assert "already complete" in capsys.readouterr().out
     assert again.table() == swept.table()
     assert {p: p.stat().st_mtime_ns for p in (swept.path / "members").rglob("*")} == before
-    with pytest.raises(ConfigMismatch, match="members"):
-        sweep(LADDER, TABLE, seeds=[3, 5], vary=VARY, **arguments)
+    with pytest.raises(ConfigMismatch) as caught:
+        sweep(LADDER, TABLE, seeds=[3, 5, 6], vary=VARY, **arguments)
+    (what,) = caught.value.differences
+    assert what == ("members.seed", [3, 4], [3, 5, 6])
+    assert len(str(caught.value)) < 500
+    with pytest.raises(ConfigMismatch, match=r"num_updates: 1 recorded, 2 asked for\n"):
+        sweep(LADDER, TABLE, seeds=[3, 4], vary=VARY, **{**arguments, "set": {"num_updates": 2}})
+
+
+@pytest.mark.integration
+def test_it_is_read_back_as_one_table(swept: Runs, tmp_path: Path) -> None:
+    """What was varied, over seeds, with the evaluations on record; wherever it was moved to."""
+    path = tmp_path / "moved"
+    shutil.copytree(swept.path, path)
+    values = iter([0.1, 0.3, 0.5, 0.6])
+    rows = [{**row, "best_metric": next(values)} for row in swept.rows]
+    write_rows(path, rows)
+    runs = Runs.load(path, LADDER)
+    assert runs.varied == ["entropy_coefficient"]
+    for run in runs.load_each("latest"):
+        run.evaluate(["test"], episodes=8)
+    low, high = runs.summary()
+    assert [low["is_best"], high["is_best"]] == [False, True]
+    assert (low["entropy_coefficient"], high["entropy_coefficient"]) == (0.01, 0.5)
+    found = [low[f"best_metric{end}"] for end in ("", "_std", "_seeds")]
+    assert found == pytest.approx([0.2, 0.1, 2])
+    name = "test-latest-sampled-m4"
+    tested = [row[name] for row in runs.table()]
+    assert high[name] == pytest.approx(np.mean(tested[2:]))
+    assert high[f"{name}_std"] == pytest.approx(np.std(tested[2:]))
+    # A run that diverged counts nowhere, and has no best checkpoint.
+    write_rows(path, [{**rows[0], "best_metric": None}, *rows[1:]])
+    runs = Runs.load(path, LADDER)
+    low = runs.summary()[0]
+    assert (low["best_metric"], low["best_metric_seeds"]) == (0.3, 1)
+    assert [run.path.name for run in runs] == [Path(row["path"]).name for row in rows[1:]]
+    shared = [run.trainer.learner for run in runs]
+    assert shared[0] is shared[-1]
+
+
+def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    (path / "evaluation" / "members.json").write_text(json.dumps({"members": rows}))
+
+
+@pytest.mark.integration
+def test_older_sweeps_are_read_and_left_alone(swept: Runs, tmp_path: Path) -> None:
+    """Members were numbered, and rows had them by name, with hyper-parameters as a group."""
+    path = tmp_path / "old"
+    shutil.copytree(swept.path, path)
+    numbers = {field.name for field in fields(Hyperparameters)}
+    rows = []
+    for index, row in enumerate(swept.rows):
+        (path / "members" / Path(row["path"]).name).rename(path / "members" / f"{index:03d}")
+        rest = {name: row[name] for name in row if name not in {"path", *numbers}}
+        own = {name: row[name] for name in numbers}
+        rows.append({"member": f"{index:03d}", **rest, "hyperparameters": own})
+    write_rows(path, rows)
+    expected = [
+        {**row, "path": str(path / "members" / f"{index:03d}")}
+        for index, row in enumerate(swept.rows)
+    ]
+    assert Runs.load(path, LADDER).table() == expected
+    arguments: dict[str, Any] = {"budget": "smoke", "workdir": path, "set": ONE_UPDATE}
+    again = sweep(LADDER, TABLE, seeds=[3, 4], vary=VARY, **arguments)
+    assert again.table() == expected
+    assert not (path / "members.partial").exists()
+
+
+@pytest.mark.integration
+def test_no_sweep_meets_another(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Whatever differs; and what it takes follows from the settings."""
+
+    def stop(*given: Any, **named: Any) -> Any:
+        return SimpleNamespace(was_interrupted=True)
+
+    monkeypatch.setattr(loop, "run", stop)
+    changes: list[dict[str, Any]] = [
+        {},
+        {"seeds": [3, 5]},
+        {"vary": {"entropy_coefficient": [0.01, 0.6]}},
+        {"set": {"num_updates": 2}},
+        {"split_seed": 1},
+    ]
+    arguments = {"seeds": [3, 4], "vary": VARY, "budget": "smoke", "runs": tmp_path}
+    paths = [sweep(LADDER, "gt3", **{**arguments, **change}).path for change in changes]
+    assert len(set(paths)) == len(changes)
+    assert sweep(LADDER, "gt3", **arguments).path == paths[0]
+    first, *_, other, _, again = capsys.readouterr().out.splitlines()
+    assert first == again
+    assert "of its steps" not in first
+    assert f"this has {2 / LADDER.budget('smoke').num_updates:.2g} of its steps" in other
+    with pytest.raises(UsageError, match="has written no members yet; run it to its end"):
+        Runs.load(paths[0], LADDER)
 
 
 @pytest.mark.integration

@@ -90,13 +90,13 @@ def test_bars_of_runs_beside_the_papers(tmp_path: Path) -> None:
         [60.0, 70.29 - 3.86, 48.0]
     )
     assert [label.get_text() for label in axes.get_xticklabels()] == [
-        "ours\n2 seeds\n1.54 k steps",
+        "jaxnew\n2 seeds\n1.54 k steps",
         "paper\n8 seeds\n40 M steps",
-        "ours\n1 seed\n1.54 k steps",
+        "jaxnew\n1 seed\n1.54 k steps",
     ]
     assert figure.get_supxlabel().split("\n") == [
-        "Error bars: ours, population std over seeds;",
-        "ours, 95 % interval over episodes (1,000 episodes a bar);",
+        "Error bars: jaxnew, population std over seeds;",
+        "jaxnew, 95 % interval over episodes (1,000 episodes a bar);",
         "paper, population std over seeds.",
     ]
     assert drawing.bars_figure(groups, {label: [] for label in rows}) is None

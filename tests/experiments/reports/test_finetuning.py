@@ -57,9 +57,9 @@ def test_fine_tuning_is_drawn_from_its_runs(
     }
     whole = paper_value("Grid World", "ours_zero_shot_whole_test_set", "test")
     assert list(content.references.items()) == [
-        ("ours, zero-shot, sets as in training (50)", 0.7),
+        ("jaxnew, zero-shot, sets as in training (50)", 0.7),
         ("paper, zero-shot, sets as in training", paper_value("Grid World", "ours", "test").mean),
-        ("ours, zero-shot, all at once (256)", 0.8),
+        ("jaxnew, zero-shot, all at once (256)", 0.8),
         ("paper, zero-shot, all at once", whole.mean),
     ]
     figure = finetuning.finetune_figure(content, "title")
@@ -80,9 +80,9 @@ def test_the_whole_test_set_has_the_no_op(tmp_path: Path) -> None:
     write_evaluation(path, "test", 0.6, set_size=5)
     write_evaluation(path, "test", 0.7, set_size=507)
     assert list(zero_shot(source, group, 1000).items()) == [
-        ("ours, zero-shot, sets as in training (5)", 0.6),
+        ("jaxnew, zero-shot, sets as in training (5)", 0.6),
         ("paper, zero-shot, sets as in training", pytest.approx(0.797, abs=1e-3)),
-        ("ours, zero-shot, all at once (507)", 0.7),
+        ("jaxnew, zero-shot, all at once (507)", 0.7),
         ("paper, zero-shot, all at once", pytest.approx(0.775, abs=1e-3)),
     ]
 
@@ -95,9 +95,9 @@ def test_zero_shot_lines_of_fine_tuning(tmp_path: Path) -> None:
     write_evaluation(path, "test", 1.5, "final_height", set_size=5)
     write_evaluation(path, "test", 1.75, "final_height", set_size=203)
     assert list(zero_shot(source, group, 1000).items()) == [
-        ("ours, zero-shot, sets as in training (5)", 1.5),
+        ("jaxnew, zero-shot, sets as in training (5)", 1.5),
         ("paper, zero-shot, sets as in training", pytest.approx(1.716, abs=1e-3)),
-        ("ours, zero-shot, all at once (203)", 1.75),
+        ("jaxnew, zero-shot, all at once (203)", 1.75),
         ("paper, zero-shot, all at once", pytest.approx(2.054, abs=1e-3)),
     ]
 

@@ -22,7 +22,13 @@ from experiments.reports.runs import Group, read_runs
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.places import UsageError
 from tests.experiments.commands import ROOT, read_json
-from tests.experiments.handwritten import finished, source_of, write_anchors, write_evaluation
+from tests.experiments.handwritten import (
+    finished,
+    source_of,
+    write_anchors,
+    write_evaluation,
+    write_run,
+)
 
 OURS = Cell("ours", "hvae")
 NO_SUBGOALS = Cell("ours", "hvae", variant="-no-subgoals")
@@ -30,6 +36,7 @@ NO_PLACE = Cell("ours", "hvae", variant="-no-place")
 SQUARE = Cell("ours", "hvae", variant="-2d-place")
 FULL = Cell("ours", "hvae", split="full")
 TOY = Cell("ours", "gt4")
+OWN = "examples.attention_policy:AttentionMethod"
 PLACE = "tests.toy_task:TASK"
 TASK = "shape_stacking"
 HEIGHT = "final_height"
@@ -187,6 +194,75 @@ def test_bars_of_fixed_sets_leave_the_axis_as_it_is(tmp_path: Path) -> None:
     figure = drawing.bars_figure(groups, {g.label: result_rows(g) for g in groups})
     assert figure.axes[0].get_ylim()[1] == 2.75
     assert "7.239 ↑" in [text.get_text() for text in figure.axes[0].texts]
+
+
+def rows_of(file: Path) -> list[dict[str, str]]:
+    with file.open() as opened:
+        return list(csv.DictReader(opened))
+
+
+def two_settings(folder: Path) -> list[Path]:
+    """Another method with two seeds, and the figure's own setting with another coefficient."""
+    source = source_of("create-push", folder, assignments=("hyperparameters.clip=0.3",))
+    own = [finished(source, Cell(OWN, "gt32"), seed) for seed in (1, 2)]
+    return [*own, finished(source, OURS)]
+
+
+@pytest.mark.unit
+def test_one_s_own_runs_are_added_to_the_bars_and_the_curves(tmp_path: Path) -> None:
+    source = source_of("create-push", tmp_path, seeds=(1,))
+    settings = paper_figures.settings_of(FIGURES["20"], source)
+    added = two_settings(tmp_path / "mine")
+    for _, cell in settings:
+        for split in ("train", "test"):
+            write_evaluation(finished(source, cell), split, 0.25, set_size=5)
+    options = Options(episodes=100, added=tuple(added))
+    runs = paper_figures.added_to(FIGURES["20"], settings, options.added)
+    assert paper_figures.missing_episodes(FIGURES["20"], settings, 100, runs) == 600
+    for mean, path in zip((0.5, 0.75, 1.0), added, strict=True):
+        for split in ("train", "test"):
+            write_evaluation(path, split, mean, set_size=5)
+    runs = paper_figures.added_to(FIGURES["20"], settings, options.added)
+    assert paper_figures.missing_episodes(FIGURES["20"], settings, 100, runs) == 0
+    picture, _, table = paper_figures.draw("20", settings, tmp_path / "out", options)
+    rows = [row for row in rows_of(table) if row["actions"] == "test"]
+    labels = ["ours, hvae, clip 0.1", "ours, hvae, no subgoals", f"{OWN}, gt32"]
+    assert [row["setting"] for row in rows] == [*labels, "ours, hvae, clip 0.3"]
+    found = [tuple(float(row[name]) for name in ("mean", "low", "high")) for row in rows]
+    assert found[2] == pytest.approx((0.625, 0.5, 0.75))  # Two seeds.
+    assert found[3] == pytest.approx((1.0, 0.98, 1.01))
+    alone, *_ = paper_figures.draw("20", settings, tmp_path / "alone", Options(episodes=100))
+    assert Image.open(picture).size[0] > 1.5 * Image.open(alone).size[0]
+    _, _, table = paper_figures.draw("24", settings, tmp_path / "out", options)
+    points = {row["setting"]: float(row["mean"]) for row in rows_of(table)}
+    assert points[f"{OWN}, gt32"] == pytest.approx(0.05)  # Validation stands last.
+
+
+@pytest.mark.unit
+def test_what_cannot_be_added_is_named(tmp_path: Path) -> None:
+    source = source_of("create-push", tmp_path, seeds=(1,))
+    other = finished(source_of("create-seesaw", tmp_path), OURS)
+    half = finished(source, Cell("continuous", "hvae"), updates=1)
+    embedded = {"task": "create", "representation": "vae", "seed": 1, "split": "default"}
+    encoder = write_run(tmp_path / "embed", {**embedded, "split_seed": 0, "model": {}})
+    for number, path, says in (
+        (
+            "20",
+            other,
+            "is a run of create-seesaw; the figure shows create-push, create-push-no-sub",
+        ),
+        ("20", half, "is not finished"),
+        ("20", encoder, "is a run of embed; train a policy on it"),
+        ("5", finished(source_of("grid_world", tmp_path), OURS), "of grid_world; .* shows create"),
+    ):
+        settings = paper_figures.settings_of(FIGURES[number], source)
+        with pytest.raises(UsageError, match=says):
+            paper_figures.added_to(FIGURES[number], settings, [path])
+    settings = paper_figures.settings_of(FIGURES["5"], source)
+    found = paper_figures.added_to(FIGURES["5"], settings, [encoder, other])
+    assert [run.path for run in found] == [encoder.resolve(), other.resolve()]
+    # Of several figures that are asked for, those of other kinds stay as they are.
+    assert paper_figures.added_to(FIGURES["8"], settings, [other]) == []
 
 
 def run_and_kill(job: jobs.Job, folder: Path) -> None:

@@ -71,7 +71,7 @@ def test_bars_draw_the_numbers() -> None:
     assert ends[1] == pytest.approx([65.0, 72.0])
     assert ends[2] == pytest.approx([50.0, 70.0])
     ticks = [label.get_text() for label in axes.get_xticklabels()]
-    assert ticks == ["ours\n1 seed", "paper\n8 seeds", "ours"]
+    assert ticks == ["jaxnew\n1 seed", "paper\n8 seeds", "jaxnew"]
     assert texts(figure) == "90.0 | 70.0 | 60.0 | mine | 20.0 | other"
     assert legend_texts(figure) == ["unseen test actions", "train actions"]
     assert figure.get_supxlabel() == "error bars: so"

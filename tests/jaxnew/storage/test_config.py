@@ -247,3 +247,21 @@ def test_differences_list_path_and_both_values() -> None:
     (only,) = differences({"a": 1}, {"a": 1, "b": 2})
     assert (only[0], repr(only[1]), only[2]) == ("b", "(absent)", 2)
     assert differences({"a": 1}, {"a": True}) == [("a", 1, True)]
+
+
+@pytest.mark.unit
+def test_of_lists_of_configurations_the_values_that_differ_are_told() -> None:
+    def members(seeds: list[int], rates: list[float], layers: int) -> dict[str, Any]:
+        group = {"size": layers, "none": None}
+        listed = [{"seed": s, "ppo": {"rate": r, "net": group}} for r in rates for s in seeds]
+        return {"members": listed}
+
+    old = members([1, 2], [0.5, 0.1], 3)
+    assert differences(old, members([1, 2], [0.5, 0.1], 3)) == []
+    assert differences(old, members([1, 2, 4], [0.5, 0.1], 5)) == [
+        ("members.seed", [1, 2], [1, 2, 4]),
+        ("members.ppo.net.size", 3, 5),
+    ]
+    one, two, three, four = old["members"]
+    ((path, *_),) = differences(old, {"members": [one, three, two, four]})
+    assert path == "members"

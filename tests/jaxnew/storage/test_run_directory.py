@@ -80,6 +80,9 @@ def test_another_configuration_is_refused_by_field(tmp_path: Path) -> None:
     assert "--workdir" in message
     assert "--overwrite" in message
     assert [path for path, _, _ in caught.value.differences] == ["ppo.rate", "ppo.clip"]
+    with pytest.raises(ConfigMismatch) as caught:
+        RunDirectory.open_or_create(tmp_path, {**CONFIG, "new": {str(i): i for i in range(999)}})
+    assert len(str(caught.value)) < 400
     assert (tmp_path / "provenance.json").read_bytes() == before
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 
 from jaxnew.storage.config import ConfigError
-from jaxnew.task.budgets import LoopConfig
+from jaxnew.task.budgets import LoopConfig, scaled_cost
 from tests.toy_device import TASK
 
 pytestmark = pytest.mark.unit
@@ -48,6 +48,12 @@ def test_steps_of_an_encoder_of_more_actions(counts_epochs: bool) -> None:
     assert budget.config("hvae", 24, 12).num_steps == (8 if counts_epochs else 4)
     assert budget.config("vae", 24, 12).num_steps == (8 if counts_epochs else 4)
     assert budget.config("vae", 12, 12) == budget.vae
+
+
+def test_what_is_foretold_follows_the_settings() -> None:
+    assert scaled_cost("1 hour", steps=1.0, recordings=1.0) == "1 hour"
+    told = scaled_cost("1 hour", steps=0.25, batches=1.0, recordings=2.0)
+    assert told == "1 hour for the preset; this has 0.25 of its steps and 2 of its recordings"
 
 
 def test_chunks_are_not_longer_than_what_a_checkpoint_saves() -> None:

@@ -1,0 +1,175 @@
+"""The runs of a sweep, read back: a row each, and one table by what was varied."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Self
+
+import numpy as np
+
+from jaxnew.ppo import Hyperparameters
+from jaxnew.run import Run, load_trainer
+from jaxnew.storage.checkpoint import Kind
+from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.task.domain import load_task
+from jaxnew.task.places import UsageError
+from jaxnew.task.settings import read_train_config
+from jaxnew.task.task import Task
+
+MEMBERS = "members"  # Name of the folder of the runs, and of the file of their rows.
+
+
+@dataclass(frozen=True)
+class Runs:
+    """The runs of a sweep, one per seed and combination of what was varied.
+
+    Attributes:
+      path: directory of the sweep.
+      rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
+        hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
+      task: what they were trained on.
+    """
+
+    path: Path
+    rows: tuple[Mapping[str, Any], ...]
+    task: Task
+
+    @classmethod
+    def load(cls, path: Path | str, task: Task | None = None) -> Self:
+        """The runs of a finished sweep.
+
+        Args:
+          path: its directory.
+          task: in place of the one that it names, for a task that no name or place leads to.
+
+        Raises:
+          UsageError: it is no sweep, or was interrupted.
+          RunDirectoryError: it is no run directory.
+        """
+        directory = RunDirectory.load(path)
+        if not is_sweep(directory):
+            raise UsageError(f"{path} is no sweep; give the directory of a run of sweep.")
+        file = directory.path / "evaluation" / f"{MEMBERS}.json"
+        if not file.exists():
+            raise UsageError(f"The sweep {path} has written no members yet; run it to its end.")
+        recorded = json.loads(file.read_text(encoding="utf-8"))[MEMBERS]
+        task = task or load_task(directory.config[MEMBERS][0]["task"])
+        rows = tuple(_row(entry, directory.path / MEMBERS) for entry in recorded)
+        return cls(directory.path, rows, task)
+
+    @property
+    def selection_metric(self) -> str:
+        """What `best_metric` is."""
+        return f"validation/{self.task.selection_metric}"
+
+    @property
+    def varied(self) -> list[str]:
+        """The hyper-parameters that differ between the runs."""
+        names = [field.name for field in fields(Hyperparameters)]
+        return [name for name in names if len({row.get(name) for row in self.rows}) > 1]
+
+    def table(self) -> list[dict[str, Any]]:
+        """Rows for `pandas.DataFrame`: `rows`, and what the runs' evaluations on record found, mean
+        selection metrics by the name of the evaluation's file (`test-best-sampled-m50`).
+        """
+        return [{**row, **self._evaluated(Path(row["path"]))} for row in self.rows]
+
+    def _evaluated(self, path: Path) -> dict[str, float]:
+        files = {file.stem: json.loads(file.read_text()) for file in path.glob("evaluation/*.json")}
+        metric = self.task.selection_metric
+        return {
+            name: files[name]["metrics"][metric]["mean"]
+            for name in sorted(files)
+            if metric in files[name].get("metrics", {})
+        }
+
+    def groups(self) -> list[tuple[dict[str, Any], dict[str, np.ndarray]]]:
+        """Per combination of what was varied its values, and f64[n] over seeds of each number:
+        of `best_metric` and of the evaluations of `table`.
+        """
+        table, varied = self.table(), self.varied
+        known = {
+            "path",
+            "seed",
+            "best_step",
+            "elapsed_s",
+            *(f.name for f in fields(Hyperparameters)),
+        }
+        names = list(dict.fromkeys(name for row in table for name in row if name not in known))
+        found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
+        for row in table:
+            found.setdefault(tuple(row[name] for name in varied), []).append(row)
+        return [
+            (
+                dict(zip(varied, values, strict=True)),
+                {n: np.array([r[n] for r in rows if r.get(n) is not None], float) for n in names},
+            )
+            for values, rows in found.items()
+        ]
+
+    def summary(self) -> list[dict[str, Any]]:
+        """Rows for `pandas.DataFrame`, one per combination of what was varied.
+
+        Its values, and of each number of `groups` the mean over seeds, `NAME_std`, the population
+        deviation, and `NAME_seeds`, how many have it; `is_best`: the best mean by validation.
+        """
+        rows: list[dict[str, Any]] = []
+        for values, numbers in self.groups():
+            row = dict(values)
+            for name, of_seeds in numbers.items():
+                has_any = bool(of_seeds.size)
+                row[name] = float(of_seeds.mean()) if has_any else None
+                row[f"{name}_std"] = float(of_seeds.std()) if has_any else None
+                row[f"{name}_seeds"] = of_seeds.size
+            rows.append(row)
+        rated = [row["best_metric"] for row in rows if row["best_metric"] is not None]
+        best = max(rated, default=None)
+        return [{**row, "is_best": best is not None and row["best_metric"] == best} for row in rows]
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    def __iter__(self) -> Iterator[Run]:
+        """Loads one run after the other, with its best checkpoint."""
+        return self.load_each()
+
+    def load_each(self, checkpoint: Kind = "best") -> Iterator[Run]:
+        """Loads one run after the other; they share their compiled parts.
+
+        Runs that were never evaluated in training, because they diverged, have no `best`.
+        """
+        trainer = None
+        for row in self.rows:
+            if checkpoint == "best" and row["best_metric"] is None:
+                continue
+            directory = RunDirectory.load(row["path"])
+            trainer = trainer or load_trainer(directory, task=self.task)
+            config, _ = read_train_config(directory.config, self.task)
+            yield Run.of(directory.path, replace(trainer, config=config), checkpoint)
+
+    def best(self) -> Run:
+        """The run with the highest validation.
+
+        Raises:
+          UsageError: the sweep was interrupted, or nothing was evaluated.
+        """
+        rated = [row for row in self.rows if row["best_metric"] is not None]
+        if not rated:
+            raise UsageError(f"{self.path} has no evaluated runs; sweep again to go on.")
+        best = max(rated, key=lambda row: row["best_metric"])
+        return Run.load(best["path"], task=self.task)
+
+
+def _row(recorded: Mapping[str, Any], folder: Path) -> dict[str, Any]:
+    """A row of `Runs`, wherever the sweep was moved to, and whichever version wrote it."""
+    row = dict(recorded)
+    path = Path(row.pop("path", None) or row.pop("member"))
+    return {"path": str(folder / path.name), **row.pop("hyperparameters", {}), **row}
+
+
+def is_sweep(directory: RunDirectory) -> bool:
+    """Whether a directory is that of a sweep, not of a single run."""
+    return MEMBERS in directory.config
