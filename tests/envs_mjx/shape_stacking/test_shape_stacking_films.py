@@ -157,11 +157,11 @@ def test_a_page_holds_what_a_film_shows(engine: MujocoC, monkeypatch: pytest.Mon
     start = rules.start(799, 0.0, 1.3)
     first = films._on_host(dropped(engine, start, SLOT, CUBE, -0.65))
     states, actions = [state_of(start), state_of(first, 1)], [action(CUBE, -0.65)]
-    given: list[tuple[np.ndarray, np.ndarray, float]] = []
+    given: list[tuple[np.ndarray, np.ndarray, float, tuple[()]]] = []
     monkeypatch.setattr(viewer, "tower_html", lambda *page: given.append(page) or "page")
     shown = films.seen(env, states, actions)
     assert films.page(shown) == "page"
-    ((ids, qpos, seconds),) = given
+    ((ids, qpos, seconds, _),) = given
     np.testing.assert_array_equal(ids, first.shape_ids)
     np.testing.assert_array_equal(qpos, np.stack([bodies.qpos for bodies in shown]))
     assert len(qpos) > 5

@@ -27,6 +27,7 @@ from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from experiments.untrained import stacking as anchors
 from experiments.untrained import towers as stacking
+from tests.envs_mjx.shape_stacking.own_shapes import CYLINDER, NUM_SHAPES, OWN, TURNED, resting
 
 pytestmark = pytest.mark.optimized
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -38,6 +39,7 @@ class OneProgram:
 
     def __init__(self, engine: Mjx, width: int) -> None:
         self.name, self.settle_steps = engine.name, engine.settle_steps
+        self.shapes = engine.shapes
         self.engine, self.width = engine, width
 
     def settle(self, shape_ids: Any, qpos: Any, qvel: Any) -> Settled:
@@ -57,8 +59,8 @@ def engine() -> OneProgram:
 
 @pytest.fixture(scope="module")
 def small() -> Mjx:
-    """Two bodies for 0.3 s: compiles and runs in less time."""
-    return Mjx(settle_steps=30, num_slots=2)
+    """Two bodies for 0.3 s: compiles and runs in less time. It has shapes of a user's own too."""
+    return Mjx(settle_steps=30, num_slots=2, shapes=OWN)
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +220,7 @@ def test_unused_bodies_come_back_parked_whatever_they_were(small: Mjx) -> None:
     [
         *[("qpos", value) for value in (np.nan, 201.0)],
         *[("qvel", value) for value in (np.inf, -51.0)],
-        *[("rise", 51.0), ("spin", 1001.0), ("id", 810), ("slot", 690)],
+        *[("rise", 51.0), ("spin", 1001.0), ("id", NUM_SHAPES), ("slot", 690)],
     ],
 )
 def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float) -> None:
@@ -239,6 +241,16 @@ def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float
     assert_near([found.qpos[2:]], [expected.qpos[2:]], 1e-5)
     # All these worlds went through one program.
     assert small._jitted._cache_size() == 1
+
+
+@pytest.mark.contract
+def test_new_shapes_stand_on_the_table(small: Mjx) -> None:
+    """Cube 690, its copy 812, and two that no published shape equals."""
+    settled = small.settle(*resting(np.array([690, 812, TURNED, CYLINDER])))  # type: ignore[arg-type]
+    assert np.asarray(settled.ok).all()
+    qpos = np.asarray(settled.qpos)
+    np.testing.assert_allclose(qpos[1], qpos[0], atol=1e-6)
+    np.testing.assert_allclose(qpos[2:, 1, 2], (-0.25, -0.2), atol=1e-3)
 
 
 @pytest.mark.contract
