@@ -131,7 +131,7 @@ def test_a_film_falls_rests_and_ends_with_the_state(
     first = Bodies(first.shape_ids, shifted, np.zeros_like(first.qvel))
     last = films._on_host(settled(engine, first))
     states = [state_of(start), state_of(first, 1), state_of(last, 2)]
-    monkeypatch.setattr(films, "draw_bodies", lambda bodies, camera, size: bodies)
+    monkeypatch.setattr(films, "draw_bodies", lambda bodies, *_: bodies)
     actions = [action(CUBE, -0.65), action(3, 0.0, stop=True)]
     shown = films.draw(env, films.seen(env, states, actions))
     np.testing.assert_array_equal(shown[0].qpos, start.qpos)

@@ -111,6 +111,10 @@ def test_drops_of_new_shapes() -> None:
     # The radius of the first cylinder and that of the cube; its yaw changes nothing.
     top = -0.5 + library.s[799] + library.bounding_radius[799]
     assert heights[10] == pytest.approx(top + 0.25 * (1.732 - 0.1), abs=1e-5)
+    # Above a new shape, 100 m high.
+    above = bodies.replace(shape_ids=bodies.shape_ids.at[2].set(TURNED))
+    expected = 100.0 + 0.25 * (2 * 1.732 - 0.1)
+    assert drop(above, np.array([*PUBLISHED, *COPIES, TURNED]))[10] == pytest.approx(expected)
 
 
 @pytest.mark.unit
@@ -187,7 +191,9 @@ def test_an_episode_with_new_shapes(played: Any) -> None:
 def test_films_and_pages_of_new_shapes(played: Any) -> None:
     env, states, _, actions = played
     shown = films.seen(env, states, actions)
-    assert shown[-2].shape_ids[3] == shown[-1].shape_ids[3] == TURNED  # Let go, and after.
+    assert shown[-2].shape_ids[3] == shown[-1].shape_ids[3] == TURNED
+    # Let go, and 0.01 s later.
+    np.testing.assert_allclose(shown[-2].qpos[3], shown[-1].qpos[3], atol=0.002)
     (picture,) = films.draw(env, shown[-1:], 42)
     center = np.round(20.5 - 101.4 / 14 * (shown[-1].qpos[3, 2] - 2)).astype(int)
     red, green, blue = picture[center, 20].astype(float)
