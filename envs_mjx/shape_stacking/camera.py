@@ -15,7 +15,7 @@ import numpy as np
 
 from envs_mjx.shape_stacking.rays import Bodies, Hits, Vector, dot, nearest, normals, walk
 from envs_mjx.shape_stacking.scene import TABLE_HEIGHT
-from envs_mjx.shape_stacking.shapes import shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 
 FRAME_SIZE = 84
 # The table as it is drawn: half-sizes along x and y, m, and gray.
@@ -95,6 +95,7 @@ def render(
     camera: Camera,
     *,
     has_shadows: bool = True,
+    shapes: tuple[Shape, ...] = (),
 ) -> jax.Array:
     """The observation of the task: shapes on their table.
 
@@ -106,12 +107,16 @@ def render(
       quaternions: f32[N, 4].
       camera: usually `task_camera`.
       has_shadows: whether the two spots cast shadows.
+      shapes: of the user's own, with ids from 810.
 
     Returns:
       uint8[84, 84] 0.299 R + 0.587 G + 0.114 B of the 8-bit picture, rounded.
     """
     picture = render_rgb(
-        shape_ids, positions, quaternions, camera, has_table=True, has_shadows=has_shadows
+        *(shape_ids, positions, quaternions, camera),
+        has_table=True,
+        has_shadows=has_shadows,
+        shapes=shapes,
     )
     red, green, blue = jnp.moveaxis(picture.astype(jnp.float32), -1, 0)
     gray = _GRAY[0] * red + _GRAY[1] * green + _GRAY[2] * blue
@@ -127,11 +132,13 @@ def render_rgb(
     has_table: bool,
     has_shadows: bool,
     size: int = FRAME_SIZE,
+    shapes: tuple[Shape, ...] = (),
 ) -> jax.Array:
     """A picture of shapes before a black background. Pure; all arrays may be traced and vmapped.
 
     Args:
-      shape_ids: int32[N] ids in 0..809; an id below 0 is not drawn, one above 809 is drawn as 809.
+      shape_ids: int32[N] ids of the library; an id below 0 is not drawn, one beyond the library as
+        its last.
       positions: f32[N, 3] origins of the shapes, m; a shape at one that is not finite is not drawn.
       quaternions: f32[N, 4] (w, x, y, z) rotations of the shapes, the yaw of their ids included
         (`ShapeLibrary.quaternion` for a shape as it is dropped); unit length.
@@ -139,6 +146,7 @@ def render_rgb(
       has_table: whether the table's top is drawn.
       has_shadows: whether the two spots cast shadows.
       size: pixels of a side.
+      shapes: of the user's own, with ids from 810.
 
     Returns:
       uint8[size, size, 3] RGB, row 0 on top.
@@ -148,7 +156,7 @@ def render_rgb(
     """
     if size < 1:
         raise ValueError(f"size={size} must be 1 or more.")
-    library = shape_library()
+    library = shape_library(shapes)
     ids = jnp.asarray(shape_ids, jnp.int32)
     chex.assert_rank(ids, 1)
     chex.assert_shape(positions, (len(ids), 3))

@@ -16,7 +16,7 @@ from envs_mjx.shape_stacking import rules, scene
 from envs_mjx.shape_stacking.camera import FRAME_SIZE, render, task_camera
 from envs_mjx.shape_stacking.engines import PHYSICS, Engine, Physics, make_engine
 from envs_mjx.shape_stacking.rules import REWARD_VARIANTS, Bodies, RewardVariant
-from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
 from jaxnew.environment import Action, ActionSpec, Environment, Info, ObservationSpec, Transition
 
 STACK_SIZE = 4
@@ -83,10 +83,10 @@ class StackingState:
 class ShapeStacking(Environment[StackingState, StackingParams]):
     """Build a high tower.
 
-    Actions: 810 shapes, `action.id`, let go above the tower (`rules.drop_height`) at
-      `action.position` in metres, clipped to [-1, 1]; `action.stop` ends the episode and places
-      nothing. A shape that was placed before in the episode, or an id that does not exist, places
-      nothing and uses the action up. After every action 3 s are simulated.
+    Actions: 810 shapes and those of `shapes`, `action.id`, let go above the tower
+      (`rules.drop_height`) at `action.position` in metres, clipped to [-1, 1]; `action.stop` ends
+      the episode and places nothing. A shape that was placed before in the episode, or an id that
+      does not exist, places nothing and uses the action up. After every action 3 s are simulated.
     Observation: uint8[84, 84, 4] gray pictures after the last four settlings, newest last.
     Reward: `rules.tower_reward` at the end of an episode, else 0.
     Ends: `terminated` by a stop, or where the simulation left the finite or plausible numbers, with
@@ -101,6 +101,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
     Attributes:
       engine: what simulates.
       position_dim: coordinates of a position: 0 (always at x = y = 0), 1 (x) or 2 (x and y).
+      shapes: of the user's own, with ids from 810.
     """
 
     name = "ShapeStacking-v0"
@@ -121,6 +122,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         reward_variant: RewardVariant = StackingSettings.reward_variant,
         has_shadows: bool = StackingSettings.has_shadows,
         max_actions: int = StackingSettings.max_actions,
+        shapes: tuple[Shape, ...] = (),
     ) -> None:
         """Takes the fields of `StackingSettings`, in place of a name also an engine.
 
@@ -129,6 +131,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
           position_dim: 0, 1 or 2; the camera of 2 looks down on the table.
           reward_variant, has_shadows, max_actions: see `StackingSettings`; the last becomes
             `default_params`.
+          shapes: of the user's own (`shapes.load_shapes`); an engine must have the same.
 
         Raises:
           ValueError: an argument is none of what is allowed.
@@ -139,8 +142,14 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         self._settings = StackingSettings(
             reward_variant=reward_variant, has_shadows=has_shadows, max_actions=max_actions
         )
-        self.engine = make_engine(physics) if isinstance(physics, str) else physics
+        self.engine = make_engine(physics, shapes) if isinstance(physics, str) else physics
         self.position_dim = position_dim
+        self.shapes = shapes
+        if self.engine.shapes != shapes:
+            raise ValueError(
+                f"The engine was made for {len(self.engine.shapes)} shapes of the user's own, the "
+                f"environment for {len(shapes)}, or for others; give both the same `shapes`."
+            )
 
     @property
     def default_params(self) -> StackingParams:
@@ -149,8 +158,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
 
     @property
     def action_spec(self) -> ActionSpec:
-        """810 shapes, `position_dim` coordinates, and a stop."""
-        return ActionSpec(NUM_SHAPES, self.position_dim, has_stop=True)
+        """810 shapes and the user's own, `position_dim` coordinates, and a stop."""
+        return ActionSpec(NUM_SHAPES + len(self.shapes), self.position_dim, has_stop=True)
 
     def observation_spec(self, params: StackingParams) -> ObservationSpec:
         """uint8[84, 84, 4]."""
@@ -204,7 +213,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         """
         del key
         stop = jnp.asarray(action.stop, bool)
-        is_valid = (action.id >= 0) & (action.id < NUM_SHAPES)
+        is_valid = (action.id >= 0) & (action.id < self.action_spec.num_actions)
         placed_ids = state.bodies.shape_ids[scene.NUM_START_CYLINDERS :]
         is_repeat = ~stop & is_valid & (placed_ids == action.id).any()
         places = ~stop & is_valid & ~is_repeat
@@ -244,7 +253,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         Of a simulation that failed, they are the bodies before the action.
         """
         slot = scene.NUM_START_CYLINDERS + state.num_actions
-        placed = rules.place(state.bodies, slot, action.id, self._position(action))
+        position = self._position(action)
+        placed = rules.place(state.bodies, slot, action.id, position, self.shapes)
         before = jax.tree.map(lambda new, old: jnp.where(places, new, old), placed, state.bodies)
         qpos, qvel, ok = self.engine.settle(before.shape_ids, before.qpos, before.qvel)
         after = Bodies(before.shape_ids, qpos, qvel)
@@ -268,4 +278,5 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
             bodies.qpos[:num_bodies, 3:],
             task_camera(self.position_dim),
             has_shadows=self._settings.has_shadows,
+            shapes=self.shapes,
         )

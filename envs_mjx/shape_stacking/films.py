@@ -19,6 +19,7 @@ from envs_mjx.shape_stacking.camera import Camera, render_rgb, task_camera
 from envs_mjx.shape_stacking.engines import Engine
 from envs_mjx.shape_stacking.environment import ShapeStacking, StackingState
 from envs_mjx.shape_stacking.rules import Bodies
+from envs_mjx.shape_stacking.shapes import Shape
 from jaxnew.environment import Action
 
 # Physics steps between pictures: shown for 60 ms each, they move as fast as the world does.
@@ -43,11 +44,15 @@ def draw(env: ShapeStacking, shown: Sequence[Bodies], size: int = 400) -> list[n
       Frames uint8[size, size, 3].
     """
     camera = task_camera(env.position_dim)
-    return [draw_bodies(bodies, camera, size) for bodies in shown]
+    return [draw_bodies(bodies, camera, size, env.shapes) for bodies in shown]
 
 
-def page(shown: Sequence[Bodies]) -> str:
+def page(shown: Sequence[Bodies], shapes: tuple[Shape, ...] = ()) -> str:
     """The moments of `seen` as a page that turns under the mouse; see `viewer.tower_html`.
+
+    Args:
+      shown: the moments.
+      shapes: of the user's own, as the environment has them.
 
     Raises:
       ImportError: Brax is missing.
@@ -55,7 +60,7 @@ def page(shown: Sequence[Bodies]) -> str:
     from envs_mjx.shape_stacking.viewer import tower_html  # Imports Brax.
 
     poses = np.stack([np.asarray(bodies.qpos) for bodies in shown])
-    return tower_html(shown[-1].shape_ids, poses, FRAME_STEPS * scene.TIMESTEP_S)
+    return tower_html(shown[-1].shape_ids, poses, FRAME_STEPS * scene.TIMESTEP_S, shapes)
 
 
 def seen(
@@ -80,7 +85,7 @@ def seen(
         )
     shown = [_on_host(states[0].bodies)]
     befores = [
-        let_go(state, after, action)
+        let_go(state, after, action, env.shapes)
         for state, after, action in zip(states[:-1], states[1:], actions, strict=True)
     ]
     between = moments(env.engine, _stacked(befores)) if befores else []
@@ -92,12 +97,15 @@ def seen(
     return shown
 
 
-def let_go(state: StackingState, after: StackingState, action: Action) -> Bodies:
+def let_go(
+    state: StackingState, after: StackingState, action: Action, shapes: tuple[Shape, ...] = ()
+) -> Bodies:
     """The bodies at the moment of an action: with its shape above the tower if it was placed.
 
     Args:
       state, after: before and after the action.
       action: with f32[k] position, k of 0 to 2.
+      shapes: of the user's own.
     """
     slot = scene.NUM_START_CYLINDERS + int(state.num_actions)
     shape_id = int(after.bodies.shape_ids[slot])
@@ -106,9 +114,8 @@ def let_go(state: StackingState, after: StackingState, action: Action) -> Bodies
     xy = np.zeros(2, np.float32)
     position = np.asarray(action.position, np.float32)
     xy[: len(position)] = np.clip(position, -1.0, 1.0)
-    return _on_host(
-        rules.place(jax.tree.map(jnp.asarray, state.bodies), slot, shape_id, jnp.asarray(xy))
-    )
+    bodies = jax.tree.map(jnp.asarray, state.bodies)
+    return _on_host(rules.place(bodies, slot, shape_id, jnp.asarray(xy), shapes))
 
 
 def moments(engine: Engine, bodies: Bodies) -> list[Bodies]:
@@ -158,13 +165,17 @@ def has_moved(before: Bodies, after: Bodies) -> bool:
     return bool(is_seen)
 
 
-def draw_bodies(bodies: Bodies, camera: Camera, size: int) -> np.ndarray:
+def draw_bodies(
+    bodies: Bodies, camera: Camera, size: int, shapes: tuple[Shape, ...] = ()
+) -> np.ndarray:
     """uint8[size, size, 3] a picture of one world on its table, with shadows."""
-    qpos = np.asarray(bodies.qpos)
-    return np.asarray(_draw(bodies.shape_ids, qpos[:, :3], qpos[:, 3:], camera, size=size))
+    state = bodies.shape_ids, np.asarray(bodies.qpos)[:, :3], np.asarray(bodies.qpos)[:, 3:]
+    return np.asarray(_draw(*state, camera, size=size, shapes=shapes))
 
 
-_draw = jax.jit(partial(render_rgb, has_table=True, has_shadows=True), static_argnames="size")
+_draw = jax.jit(
+    partial(render_rgb, has_table=True, has_shadows=True), static_argnames=("size", "shapes")
+)
 
 
 def _on_host(bodies: Bodies) -> Bodies:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking.camera import FRAME_SIZE, orbit_camera, render_rgb
-from envs_mjx.shape_stacking.shapes import NUM_SHAPES, shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 
 NUM_VIEWS = 1024
 PICTURE_SHAPE = (FRAME_SIZE, FRAME_SIZE, 3)
@@ -72,7 +72,7 @@ def record_block(
     return np.tile(views, (len(ids), 1, 1))
 
 
-def draw_pictures(ids: np.ndarray, views: np.ndarray) -> np.ndarray:
+def draw_pictures(ids: np.ndarray, views: np.ndarray, shapes: tuple[Shape, ...] = ()) -> np.ndarray:
     """Pictures of shapes.
 
     A shape's origin is at (0, 0, 0), it has the yaw and the colour of its id, the background is
@@ -81,6 +81,7 @@ def draw_pictures(ids: np.ndarray, views: np.ndarray) -> np.ndarray:
     Args:
       ids: int32[n] shapes.
       views: f32[n, 2] azimuth, rad, and height, m, of each.
+      shapes: of the user's own, with ids from 810.
 
     Returns:
       uint8[n, 84, 84, 3] RGB.
@@ -88,24 +89,28 @@ def draw_pictures(ids: np.ndarray, views: np.ndarray) -> np.ndarray:
     Raises:
       ValueError: an id is no shape.
     """
-    ids = np.asarray(ids)
-    outside = ids[(ids < 0) | (ids >= NUM_SHAPES)]
+    ids, num_shapes = np.asarray(ids), len(shape_library(shapes).s)
+    outside = ids[(ids < 0) | (ids >= num_shapes)]
     if outside.size:
-        raise ValueError(f"Shape {outside[0]} does not exist; ids are 0..{NUM_SHAPES - 1}.")
+        raise ValueError(f"Shape {outside[0]} does not exist; ids are 0..{num_shapes - 1}.")
     views_at_once = _VIEWS_AT_ONCE.get(jax.default_backend(), _VIEWS_AT_ONCE_ELSEWHERE)
-    views = np.asarray(views, np.float32)
-    return np.asarray(_draw(jnp.asarray(ids, jnp.int32), jnp.asarray(views), views_at_once))
+    arrays = jnp.asarray(ids, jnp.int32), jnp.asarray(views, jnp.float32)
+    return np.asarray(_draw(*arrays, views_at_once, shapes))
 
 
-@partial(jax.jit, static_argnames="views_at_once")
-def _draw(ids: jax.Array, views: jax.Array, views_at_once: int) -> jax.Array:
+@partial(jax.jit, static_argnames=("views_at_once", "shapes"))
+def _draw(
+    ids: jax.Array, views: jax.Array, views_at_once: int, shapes: tuple[Shape, ...] = ()
+) -> jax.Array:
     """uint8[n, 84, 84, 3]"""
-    return jax.lax.map(lambda x: _picture(*x), (ids, views), batch_size=views_at_once)
+    return jax.lax.map(
+        lambda x: _picture(x[0], x[1], shapes), (ids, views), batch_size=views_at_once
+    )
 
 
-def _picture(shape_id: jax.Array, view: jax.Array) -> jax.Array:
+def _picture(shape_id: jax.Array, view: jax.Array, shapes: tuple[Shape, ...]) -> jax.Array:
     """uint8[84, 84, 3] from view f32[2]."""
-    quaternion = jnp.asarray(shape_library().quaternion, jnp.float32)[shape_id]
+    quaternion = jnp.asarray(shape_library(shapes).quaternion, jnp.float32)[shape_id]
     camera = orbit_camera(view[0], view[1])
     # A shape alone has nothing to cast shadows on, but for the sides of an arch's opening.
     return render_rgb(
@@ -115,4 +120,5 @@ def _picture(shape_id: jax.Array, view: jax.Array) -> jax.Array:
         camera,
         has_table=False,
         has_shadows=False,
+        shapes=shapes,
     )

@@ -1,7 +1,7 @@
 """The rules of stacking as pure functions: starts, drops, heights, rewards.
 
-All are for one world and may be vmapped. See docs/shape_stacking.md, "Start", "Action" and "Height
-and reward".
+All are for one world and may be vmapped. `shapes` are those of the user's own, with ids from 810.
+See docs/shape_stacking.md, "Start", "Action" and "Height and reward".
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import numpy as np
 from flax import struct
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.shapes import shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 
 # Two copies of one of these stand on the table when an episode starts.
 START_CYLINDERS = (798, 799, 800)
@@ -67,10 +67,10 @@ class ShapeTable:
     bounding_radius: jax.Array
 
 
-@lru_cache(maxsize=1)
-def shape_table() -> ShapeTable:
+@lru_cache(maxsize=8)
+def shape_table(shapes: tuple[Shape, ...]) -> ShapeTable:
     """The library's, as NumPy arrays, so that every program may hold them as constants."""
-    library = shape_library()
+    library = shape_library(shapes)
     fields = (library.s, library.quaternion, library.center_of_mass, library.bounding_radius)
     return ShapeTable(*(np.asarray(field, np.float32) for field in fields))  # type: ignore[arg-type]
 
@@ -86,30 +86,36 @@ def start(
     """
     half = jnp.asarray(gap, jnp.float32) / 2.0
     x = jnp.asarray(center, jnp.float32) + jnp.stack([-half, half])
-    z = scene.TABLE_HEIGHT + jnp.asarray(shape_table().s)[cylinder_id]
+    z = scene.TABLE_HEIGHT + jnp.asarray(shape_table(()).s)[cylinder_id]
     qpos = jnp.asarray(scene.parked_qpos())
     qpos = qpos.at[:2, :3].set(jnp.stack([x, jnp.zeros(2), jnp.full(2, z)], axis=-1))
     shape_ids = jnp.full(scene.NUM_SLOTS, _UNUSED, jnp.int32).at[:2].set(cylinder_id)
     return Bodies(shape_ids, qpos, jnp.zeros((scene.NUM_SLOTS, 6), jnp.float32))
 
 
-def top(bodies: Bodies) -> jax.Array:
+def top(bodies: Bodies, shapes: tuple[Shape, ...] = ()) -> jax.Array:
     """f32[] highest z of a bounding sphere around a centre of mass; 0 with no bodies."""
-    table = jax.tree.map(jnp.asarray, shape_table())
+    table = jax.tree.map(jnp.asarray, shape_table(shapes))
     offsets = _rotated(bodies.qpos[:, 3:], table.center_of_mass[bodies.shape_ids])
     tops = bodies.qpos[:, 2] + offsets[:, 2] + table.bounding_radius[bodies.shape_ids]
     highest = jnp.max(tops, where=bodies.is_used, initial=-jnp.inf)
     return jnp.where(bodies.is_used.any(), highest, 0.0)
 
 
-def drop_height(bodies: Bodies, shape_id: jax.Array | int) -> jax.Array:
+def drop_height(
+    bodies: Bodies, shape_id: jax.Array | int, shapes: tuple[Shape, ...] = ()
+) -> jax.Array:
     """f32[] z at which the origin of a new body of this shape is let go, m."""
-    table = jax.tree.map(jnp.asarray, shape_table())
-    return top(bodies) + table.bounding_radius[shape_id] - _OVERLAP * table.s[shape_id]
+    table = jax.tree.map(jnp.asarray, shape_table(shapes))
+    return top(bodies, shapes) + table.bounding_radius[shape_id] - _OVERLAP * table.s[shape_id]
 
 
 def place(
-    bodies: Bodies, slot: jax.Array | int, shape_id: jax.Array | int, position: jax.Array
+    bodies: Bodies,
+    slot: jax.Array | int,
+    shape_id: jax.Array | int,
+    position: jax.Array,
+    shapes: tuple[Shape, ...] = (),
 ) -> Bodies:
     """Puts a new body above the others, turned by its yaw, and stops all bodies.
 
@@ -118,9 +124,10 @@ def place(
       slot: int32[] an unused body of the pool.
       shape_id: int32[].
       position: f32[2] x and y of the new body's origin, m.
+      shapes: of the user's own.
     """
-    height = drop_height(bodies, shape_id)
-    quaternion = jnp.asarray(shape_table().quaternion)[shape_id]
+    height = drop_height(bodies, shape_id, shapes)
+    quaternion = jnp.asarray(shape_table(shapes).quaternion)[shape_id]
     pose = jnp.concatenate([position, height[None], quaternion]).astype(jnp.float32)
     return Bodies(
         shape_ids=bodies.shape_ids.at[slot].set(shape_id),

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from envs_mjx.shape_stacking.shapes import shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES, solids
 
 # Two start cylinders and ten placements.
@@ -78,10 +78,10 @@ class Form:
         return name if name in PRIMITIVES else "mesh"
 
 
-@lru_cache(maxsize=1)
-def forms() -> tuple[tuple[Form, ...], np.ndarray]:
-    """All forms of the library, and the form of each shape, int32[810]."""
-    library = shape_library()
+@lru_cache(maxsize=8)
+def forms(shapes: tuple[Shape, ...] = ()) -> tuple[tuple[Form, ...], np.ndarray]:
+    """All forms of the library with `shapes`, and the form of each shape, int32[A]."""
+    library = shape_library(shapes)
     keys = np.stack([library.class_labels, library.scale_index], axis=-1)
     _, first, form_of = np.unique(keys, axis=0, return_index=True, return_inverse=True)
     found = []
@@ -148,9 +148,9 @@ def body_text(
     )
 
 
-def inertial_text(shape_id: int) -> str:
+def inertial_text(shape_id: int, shapes: tuple[Shape, ...] = ()) -> str:
     """Mass, centre of mass and inertia of a shape, from the library's true solids."""
-    library = shape_library()
+    library = shape_library(shapes)
     return (
         f'<inertial mass="{_text([library.mass[shape_id]])}"'
         f' pos="{_text(library.center_of_mass[shape_id])}"'

@@ -14,7 +14,7 @@ import numpy as np
 from envs_mjx import brax_adapter
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.camera import TABLE_COLOR, TABLE_HALF_SIZES
-from envs_mjx.shape_stacking.shapes import NUM_SHAPES, shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 from envs_mjx.shape_stacking.solids import ARCH_OPENING_RADIUS, CLASS_NAMES, solids
 
 # Where a body waits for its first frame: above its first place, beyond the viewer's fog (60 m).
@@ -29,6 +29,7 @@ def tower_html(
     shape_ids: jax.Array | np.ndarray,
     qpos: jax.Array | np.ndarray,
     seconds_per_frame: float = 0.5,
+    shapes: tuple[Shape, ...] = (),
 ) -> str:
     """A page that plays the bodies of an episode; the mouse turns the view.
 
@@ -43,6 +44,7 @@ def tower_html(
       qpos: f32[T, 12, 7] `Bodies.qpos` at each moment: position and quaternion (w, x, y, z). A body
         waits where it is at its place of `scene.parked_qpos`.
       seconds_per_frame: on the viewer's clock, s.
+      shapes: of the user's own, with ids from 810.
 
     Returns:
       HTML text, to be written to a file. See `brax_adapter.render_page` for what it loads.
@@ -52,12 +54,12 @@ def tower_html(
         a time that is not positive.
     """
     shape_ids, qpos = np.asarray(shape_ids), np.asarray(qpos)
-    _check(shape_ids, qpos, seconds_per_frame)
+    _check(shape_ids, qpos, seconds_per_frame, len(shape_library(shapes).s))
     slots = np.flatnonzero(shape_ids >= 0)
     geoms: dict[str, list[Geom]] = {"world": [_table()]}
     for link, slot in enumerate(slots):
-        geom = body_geom(int(shape_ids[slot])) | {"link_idx": link}
-        geoms[_body_name(int(slot), int(shape_ids[slot]))] = [geom]
+        geom = body_geom(int(shape_ids[slot]), shapes) | {"link_idx": link}
+        geoms[_body_name(int(slot), int(shape_ids[slot]), shapes)] = [geom]
     poses = np.stack([_with_waiting(int(slot), qpos[:, slot]) for slot in slots], axis=1)
     frames = [{"pos": p[:, :3].tolist(), "rot": p[:, 3:].tolist()} for p in poses]
     return brax_adapter.render_page(
@@ -65,20 +67,21 @@ def tower_html(
     )
 
 
-def body_geom(shape_id: int) -> Geom:
+def body_geom(shape_id: int, shapes: tuple[Shape, ...] = ()) -> Geom:
     """What the viewer draws for a shape, in the axes of its body.
 
     Args:
       shape_id: of the library.
+      shapes: of the user's own, with ids from 810.
 
     Returns:
       Brax's entry of a geometry without `link_idx`: `name` (`Sphere`, `Capsule`, `Cylinder` or
       `Mesh`), `pos`, `rot` (w, x, y, z), `rgba`, `size` (radius, half-length) and, of meshes,
       `vert` [n, 3] and `face` [m, 3], counter-clockwise seen from outside.
     """
-    all_forms, form_of = scene.forms()
+    all_forms, form_of = scene.forms(shapes)
     form = all_forms[form_of[shape_id]]
-    color = shape_library().color[shape_id]
+    color = shape_library(shapes).color[shape_id]
     geom: Geom = {
         "name": form.kind.capitalize(),
         "pos": [0.0, 0.0, 0.0],
@@ -92,16 +95,18 @@ def body_geom(shape_id: int) -> Geom:
     return geom
 
 
-def _check(shape_ids: np.ndarray, qpos: np.ndarray, seconds_per_frame: float) -> None:
+def _check(
+    shape_ids: np.ndarray, qpos: np.ndarray, seconds_per_frame: float, num_shapes: int
+) -> None:
     num_slots = scene.NUM_SLOTS
     if shape_ids.shape != (num_slots,) or qpos.shape[1:] != (num_slots, 7) or not len(qpos):
         raise ValueError(
             f"shape_ids and qpos have the shapes {shape_ids.shape} and {qpos.shape}; give "
             f"({num_slots},) and (T, {num_slots}, 7) with at least one frame."
         )
-    if (shape_ids >= NUM_SHAPES).any() or (shape_ids < 0).all():
+    if (shape_ids >= num_shapes).any() or (shape_ids < 0).all():
         raise ValueError(
-            f"shape_ids={shape_ids.tolist()}: give ids 0..{NUM_SHAPES - 1}, or below 0 for unused "
+            f"shape_ids={shape_ids.tolist()}: give ids 0..{num_shapes - 1}, or below 0 for unused "
             "bodies, and at least one body."
         )
     if not np.isfinite(qpos[:, shape_ids >= 0]).all():
@@ -112,9 +117,9 @@ def _check(shape_ids: np.ndarray, qpos: np.ndarray, seconds_per_frame: float) ->
         )
 
 
-def _body_name(slot: int, shape_id: int) -> str:
+def _body_name(slot: int, shape_id: int, shapes: tuple[Shape, ...]) -> str:
     """Such as `02_cube_690`: the viewer lists bodies by it, and allows no blanks and no dots."""
-    return f"{slot:02d}_{CLASS_NAMES[shape_library().class_labels[shape_id]]}_{shape_id}"
+    return f"{slot:02d}_{CLASS_NAMES[shape_library(shapes).class_labels[shape_id]]}_{shape_id}"
 
 
 def _table() -> Geom:

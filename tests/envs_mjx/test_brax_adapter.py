@@ -229,7 +229,7 @@ def test_brax_wrappers_see_the_episodes_of_the_house(
 class Still:
     """A physics engine that moves nothing."""
 
-    name, settle_steps = "still", 1
+    name, settle_steps, shapes = "still", 1, ()
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         return Settled(qpos, qvel, jnp.bool_(True))

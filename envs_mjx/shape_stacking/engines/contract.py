@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
+from envs_mjx.shape_stacking.shapes import Shape
 
 # What no world of this task can come to. In a settling of 3 s a body falls at most 44 m and reaches
 # 29 m/s; the smallest sphere would then roll at 370 rad/s. Parking ends at x = 53 and z = 100.
@@ -41,10 +42,12 @@ class Engine(Protocol):
     Attributes:
       name: short, such as `mujoco_c`.
       settle_steps: physics steps of 0.01 s in one call.
+      shapes: of the user's own, with ids from 810.
     """
 
     name: str
     settle_steps: int
+    shapes: tuple[Shape, ...]
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         """Simulates `settle_steps` physics steps.

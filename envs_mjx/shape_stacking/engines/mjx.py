@@ -15,7 +15,7 @@ from envs_mjx.shape_stacking.engines import _mjx_private, mjx_pool
 from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
 from envs_mjx.shape_stacking.engines.mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
-from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
 
 # Line searches always take all their steps here. With 8 and 12 towers end no nearer to C's; with 2
 # and 3 a cube that tips off an edge ends 5 cm from where it should (docs/shape_stacking.md,
@@ -41,6 +41,7 @@ class Mjx:
       name: `mjx`.
       settle_steps: physics steps of 0.01 s in one call.
       num_slots: bodies that are simulated.
+      shapes: of the user's own, with ids from 810.
     """
 
     name = "mjx"
@@ -52,6 +53,7 @@ class Mjx:
         max_contacts: int = MAX_CONTACTS,
         solver: scene.Solver = SOLVER,
         limits: Limits | None = None,
+        shapes: tuple[Shape, ...] = (),
     ) -> None:
         """
         Args:
@@ -61,6 +63,7 @@ class Mjx:
           max_contacts: points of contact in a world, at least 1; the deepest are kept.
           solver: upper bounds of Newton's method.
           limits: of the pairs of bodies that are looked at closely; None for the usual ones.
+          shapes: of the user's own.
 
         Raises:
           ValueError: a number is out of its range.
@@ -75,6 +78,7 @@ class Mjx:
         _mjx_private.check_version()
         self.settle_steps = settle_steps
         self.num_slots = num_slots
+        self.shapes = shapes
         self._limits = limits or Limits()
         model = mujoco.MjModel.from_xml_string(_scene_text(num_slots, solver, max_contacts))
         self._model = _mjx_private.mjx.put_model(model, impl="jax")
@@ -107,7 +111,8 @@ class Mjx:
         end_qpos, end_qvel = self._simulated(shape_ids[:n], start_qpos[:n], start_qvel[:n])
         end_qpos = jnp.where(is_unused, parked, start_qpos.at[:n].set(end_qpos))
         end_qvel = jnp.where(is_unused, 0.0, start_qvel.at[:n].set(end_qvel))
-        is_possible = (shape_ids < NUM_SHAPES).all() & is_unused[n:].all()
+        num_shapes = NUM_SHAPES + len(self.shapes)
+        is_possible = (shape_ids < num_shapes).all() & is_unused[n:].all()
         ok = is_possible & is_plausible(start_qpos, start_qvel) & is_plausible(end_qpos, end_qvel)
         return Settled(jnp.where(ok, end_qpos, qpos), jnp.where(ok, end_qvel, qvel), ok)
 
@@ -117,9 +122,9 @@ class Mjx:
         """One world from a cold start; arrays [num_slots, ...]."""
         step = partial(
             _step,
-            mjx_pool.with_shapes(self._model, shape_ids),
+            mjx_pool.with_shapes(self._model, shape_ids, self.shapes),
             self._data,
-            mjx_pool.pool(shape_ids),
+            mjx_pool.pool(shape_ids, self.shapes),
             self._limits,
         )
         start = (qpos.ravel(), qvel.ravel(), jnp.zeros(qvel.size))

@@ -18,7 +18,7 @@ from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
 from envs_mjx.shape_stacking.engines.hull_contacts import APART, Hull, four_corners, hull_hull
 from envs_mjx.shape_stacking.hulls import HullTable
-from envs_mjx.shape_stacking.shapes import shape_library
+from envs_mjx.shape_stacking.shapes import Shape, shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
 
@@ -68,10 +68,10 @@ class Pool(NamedTuple):
     edge_points: jax.Array
 
 
-@lru_cache(maxsize=1)
-def _constants() -> dict[str, np.ndarray]:
+@lru_cache(maxsize=8)
+def _constants(shapes: tuple[Shape, ...] = ()) -> dict[str, np.ndarray]:
     """What `pool` and `with_shapes` look up, per shape or per class, f32 and int32."""
-    library = shape_library()
+    library = shape_library(shapes)
     values = {
         "label": library.class_labels,
         "s": library.s,
@@ -107,9 +107,9 @@ def _edge_directions(edge_normals: np.ndarray) -> np.ndarray:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
-def pool(shape_ids: jax.Array) -> Pool:
-    """The shapes of the slots; shape_ids int32[n], below 0 for unused ones."""
-    table = {name: jnp.asarray(value) for name, value in _constants().items()}
+def pool(shape_ids: jax.Array, shapes: tuple[Shape, ...] = ()) -> Pool:
+    """The shapes of the slots; shape_ids int32[n], below 0 for unused ones, `shapes` from 810."""
+    table = {name: jnp.asarray(value) for name, value in _constants(shapes).items()}
     label, s = table["label"][shape_ids], table["s"][shape_ids]
     is_used, has_hull = shape_ids >= 0, table["has_hull"][label]
     is_sphere = label == CLASS_NAMES.index("sphere")
@@ -129,9 +129,9 @@ def pool(shape_ids: jax.Array) -> Pool:
     )
 
 
-def with_shapes(model: Any, shape_ids: jax.Array) -> Any:
+def with_shapes(model: Any, shape_ids: jax.Array, shapes: tuple[Shape, ...] = ()) -> Any:
     """`mjx.Model` whose bodies have the masses of these shapes, int32[n]; any for unused slots."""
-    table = {name: jnp.asarray(value) for name, value in _constants().items()}
+    table = {name: jnp.asarray(value) for name, value in _constants(shapes).items()}
     mass, inertia = table["mass"][shape_ids], table["inertia"][shape_ids]
     # The inverse of what a contact has to move, which softness is relative to.
     inverse = jnp.stack([1.0 / mass, jnp.mean(1.0 / inertia, axis=-1)], axis=-1)

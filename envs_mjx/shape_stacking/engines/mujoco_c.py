@@ -12,7 +12,7 @@ from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
 from envs_mjx.shape_stacking.engines.mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
-from envs_mjx.shape_stacking.shapes import NUM_SHAPES
+from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
 from jaxnew.cores import available_cores
 
 _CAPACITY = 256
@@ -39,6 +39,7 @@ class MujocoC:
       name: `mujoco_c`.
       settle_steps: physics steps of 0.01 s in one call.
       num_threads: worlds that are simulated at once.
+      shapes: of the user's own, with ids from 810.
     """
 
     name = "mujoco_c"
@@ -48,6 +49,7 @@ class MujocoC:
         settle_steps: int = scene.SETTLE_STEPS,
         num_threads: int = 0,
         has_multiple_contacts: bool = False,
+        shapes: tuple[Shape, ...] = (),
     ) -> None:
         """
         Args:
@@ -55,6 +57,7 @@ class MujocoC:
           num_threads: 0 for one per core that this process may use.
           has_multiple_contacts: two hulls touch in several points where their faces or edges lie
             on each other, as in MuJoCo's present defaults and much as in MJX: steadier towers.
+          shapes: of the user's own.
 
         Raises:
           ValueError: a number is out of its range.
@@ -65,7 +68,8 @@ class MujocoC:
             raise ValueError(f"num_threads={num_threads} must be 0 (one per core) or more.")
         self.settle_steps = settle_steps
         self.num_threads = num_threads or available_cores()
-        self._worlds = Worlds(_CAPACITY, self.num_threads, has_multiple_contacts)
+        self.shapes = shapes
+        self._worlds = Worlds(_CAPACITY, self.num_threads, has_multiple_contacts, shapes)
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         """Simulates `settle_steps` physics steps; arrays as in `engines.Engine.settle`.
@@ -95,9 +99,10 @@ class MujocoC:
         """
         shape_ids, qpos, qvel = np.asarray(shape_ids), np.asarray(qpos), np.asarray(qvel)
         check_state(shape_ids, qpos, qvel)
-        if (shape_ids >= NUM_SHAPES).any():
+        num_shapes = NUM_SHAPES + len(self.shapes)
+        if (shape_ids >= num_shapes).any():
             raise ValueError(
-                f"shape_ids has {shape_ids.max()}; ids are 0..{NUM_SHAPES - 1}, or below 0 for "
+                f"shape_ids has {shape_ids.max()}; ids are 0..{num_shapes - 1}, or below 0 for "
                 "unused bodies."
             )
         ids = shape_ids.reshape(-1, NUM_SLOTS)

@@ -3,7 +3,7 @@
 A compiled model cannot give a geom another type, so a body of the pool holds four geoms: sphere,
 capsule, cylinder and mesh. In each world at most one of the four collides; the others have their
 collision bits off. All hulls of the library are assets of the one model, and a world's mesh geom
-points at the hull that it needs.
+points at the hull that it needs. `shapes` are those of the user's own, with ids from 810.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from mujoco import batch as mujoco_batch
 
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.scene import NUM_SLOTS, PRIMITIVES
+from envs_mjx.shape_stacking.shapes import Shape
 
 GEOM_KINDS = (*PRIMITIVES, "mesh")
 
@@ -42,10 +43,12 @@ def _options(has_multiple_contacts: bool) -> str:
     return f'{_MEMORY}<option><flag midphase="disable" multiccd="{multiccd}"/></option>'
 
 
-@lru_cache(maxsize=2)
-def pool_model(has_multiple_contacts: bool = False) -> mujoco.MjModel:
+@lru_cache(maxsize=4)
+def pool_model(
+    has_multiple_contacts: bool = False, shapes: tuple[Shape, ...] = ()
+) -> mujoco.MjModel:
     """The model behind all worlds: the table, twelve bodies of four geoms, every hull."""
-    forms, _ = scene.forms()
+    forms, _ = scene.forms(shapes)
     # Its centre of mass is not its origin; for bodies that are centred the compiler takes
     # shortcuts, which the other shapes of a slot could not follow.
     example = next(form for form in forms if form.kind == "mesh")
@@ -59,13 +62,13 @@ def pool_model(has_multiple_contacts: bool = False) -> mujoco.MjModel:
     return _compiled(bodies, _hulls(forms), has_multiple_contacts)
 
 
-def catalogue_model() -> mujoco.MjModel:
+def catalogue_model(shapes: tuple[Shape, ...] = ()) -> mujoco.MjModel:
     """Every form as a free body with its one geom; form k is body k + 1 and geom k + 1."""
-    forms, _ = scene.forms()
+    forms, _ = scene.forms(shapes)
     origin = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
     bodies = [
         scene.body_text(
-            form.name, scene.inertial_text(form.shape_id), [scene.geom_text(form)], origin
+            form.name, scene.inertial_text(form.shape_id, shapes), [scene.geom_text(form)], origin
         )
         for form in forms
     ]
@@ -103,14 +106,14 @@ def _compiled(bodies: list[str], assets: list[str], has_multiple_contacts: bool)
     return mujoco.MjModel.from_xml_string(text)
 
 
-@lru_cache(maxsize=1)
-def _slot_values() -> dict[str, np.ndarray]:
+@lru_cache(maxsize=4)
+def _slot_values(shapes: tuple[Shape, ...]) -> dict[str, np.ndarray]:
     """What a slot's rows of each field are, per form: {field: [forms + 1, rows, ...]}.
 
     The last entry is the unused body: as form 0, but nothing collides.
     """
-    catalogue, pool = catalogue_model(), pool_model()
-    forms, _ = scene.forms()
+    catalogue, pool = catalogue_model(shapes), pool_model(False, shapes)
+    forms, _ = scene.forms(shapes)
     used = np.array([GEOM_KINDS.index(form.kind) for form in forms])
     is_used = used[:, None] == np.arange(len(GEOM_KINDS))
     values = {name: getattr(catalogue, name)[1:, None] for name in _BODY_FIELDS}
@@ -143,9 +146,17 @@ def _no_log() -> Iterator[None]:
 class Worlds:
     """Scratch space for up to `capacity` worlds; a run overwrites all that its results hang on."""
 
-    def __init__(self, capacity: int, num_threads: int, has_multiple_contacts: bool) -> None:
-        self._values = _slot_values()
-        self._batch = mujoco_batch.Batch(pool_model(has_multiple_contacts), capacity, num_threads)
+    def __init__(
+        self,
+        capacity: int,
+        num_threads: int,
+        has_multiple_contacts: bool,
+        shapes: tuple[Shape, ...] = (),
+    ) -> None:
+        self._values = _slot_values(shapes)
+        _, self._form_of = scene.forms(shapes)
+        model = pool_model(has_multiple_contacts, shapes)
+        self._batch = mujoco_batch.Batch(model, capacity, num_threads)
         self._fields = {name: self._batch.expand(name) for name in self._values}
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._warmstart = self._batch.bind("qacc_warmstart")
@@ -192,8 +203,7 @@ class Worlds:
 
     def _set_shapes(self, shape_ids: np.ndarray) -> None:
         """Gives the first `len(shape_ids)` worlds their shapes."""
-        _, form_of = scene.forms()
-        selected = np.where(shape_ids < 0, -1, form_of[shape_ids])
+        selected = np.where(shape_ids < 0, -1, self._form_of[shape_ids])
         for name, values in self._values.items():
             field, rows = self._fields[name], values[selected]  # [n, 12, rows of a slot, ...].
             num_fixed = field.shape[1] - NUM_SLOTS * rows.shape[2]  # Of the world and the table.

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.unit
 class Recorder:
     """An engine that moves nothing, and fails where body `fails_at` is in use."""
 
-    name, settle_steps = "recorder", 1
+    name, settle_steps, shapes = "recorder", 1, ()
 
     def __init__(self, fails_at: int = scene.NUM_SLOTS) -> None:
         self.fails_at = fails_at

@@ -131,7 +131,7 @@ def test_a_film_falls_rests_and_ends_with_the_state(
     first = Bodies(first.shape_ids, shifted, np.zeros_like(first.qvel))
     last = films._on_host(settled(engine, first))
     states = [state_of(start), state_of(first, 1), state_of(last, 2)]
-    monkeypatch.setattr(films, "draw_bodies", lambda bodies, camera, size: bodies)
+    monkeypatch.setattr(films, "draw_bodies", lambda bodies, *_: bodies)
     actions = [action(CUBE, -0.65), action(3, 0.0, stop=True)]
     shown = films.draw(env, films.seen(env, states, actions))
     np.testing.assert_array_equal(shown[0].qpos, start.qpos)
@@ -157,11 +157,11 @@ def test_a_page_holds_what_a_film_shows(engine: MujocoC, monkeypatch: pytest.Mon
     start = rules.start(799, 0.0, 1.3)
     first = films._on_host(dropped(engine, start, SLOT, CUBE, -0.65))
     states, actions = [state_of(start), state_of(first, 1)], [action(CUBE, -0.65)]
-    given: list[tuple[np.ndarray, np.ndarray, float]] = []
+    given: list[tuple[np.ndarray, np.ndarray, float, tuple[()]]] = []
     monkeypatch.setattr(viewer, "tower_html", lambda *page: given.append(page) or "page")
     shown = films.seen(env, states, actions)
     assert films.page(shown) == "page"
-    ((ids, qpos, seconds),) = given
+    ((ids, qpos, seconds, _),) = given
     np.testing.assert_array_equal(ids, first.shape_ids)
     np.testing.assert_array_equal(qpos, np.stack([bodies.qpos for bodies in shown]))
     assert len(qpos) > 5

@@ -27,6 +27,7 @@ from envs_mjx.shape_stacking.engines.mjx import Mjx
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
 from experiments.untrained import stacking as anchors
 from experiments.untrained import towers as stacking
+from tests.envs_mjx.shape_stacking.own_shapes import NUM_SHAPES, OWN, TURNED, resting
 
 pytestmark = pytest.mark.optimized
 Arrays = tuple[np.ndarray, np.ndarray, np.ndarray]
@@ -38,6 +39,7 @@ class OneProgram:
 
     def __init__(self, engine: Mjx, width: int) -> None:
         self.name, self.settle_steps = engine.name, engine.settle_steps
+        self.shapes = engine.shapes
         self.engine, self.width = engine, width
 
     def settle(self, shape_ids: Any, qpos: Any, qvel: Any) -> Settled:
@@ -57,8 +59,8 @@ def engine() -> OneProgram:
 
 @pytest.fixture(scope="module")
 def small() -> Mjx:
-    """Two bodies for 0.3 s: compiles and runs in less time."""
-    return Mjx(settle_steps=30, num_slots=2)
+    """Two bodies for 0.3 s: compiles and runs in less time. It has shapes of a user's own too."""
+    return Mjx(settle_steps=30, num_slots=2, shapes=OWN)
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +220,7 @@ def test_unused_bodies_come_back_parked_whatever_they_were(small: Mjx) -> None:
     [
         *[("qpos", value) for value in (np.nan, 201.0)],
         *[("qvel", value) for value in (np.inf, -51.0)],
-        *[("rise", 51.0), ("spin", 1001.0), ("id", 810), ("slot", 690)],
+        *[("rise", 51.0), ("spin", 1001.0), ("id", NUM_SHAPES), ("slot", 690)],
     ],
 )
 def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float) -> None:
@@ -239,6 +241,22 @@ def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float
     assert_near([found.qpos[2:]], [expected.qpos[2:]], 1e-5)
     # All these worlds went through one program.
     assert small._jitted._cache_size() == 1
+
+
+@pytest.mark.contract
+def test_new_shapes_stand_on_the_table(small: Mjx) -> None:
+    """Cube 690, its copy 812, and one that no published shape equals.
+
+    In the air it keeps its spin about any axis, which a cylinder's inertia would turn.
+    """
+    ids, qpos, qvel = resting(np.array([690, 812, TURNED, TURNED]))
+    qpos[3, 1, 2], qvel[3, 1, 3:] = 2.0, (3.0, 0.0, 4.0)
+    settled = small.settle(ids, qpos, qvel)  # type: ignore[arg-type]
+    assert np.asarray(settled.ok).all()
+    rested = np.asarray(settled.qpos)
+    np.testing.assert_allclose(rested[1], rested[0], atol=1e-6)
+    assert rested[2, 1, 2] == pytest.approx(-0.25, abs=1e-3)
+    np.testing.assert_allclose(settled.qvel[3, 1, 3:], (3.0, 0.0, 4.0), atol=1e-4)
 
 
 @pytest.mark.contract
