@@ -11,9 +11,11 @@ from functools import partial
 from typing import Any
 
 from envs_mjx.shape_stacking import (
+    Shape,
     ShapeStacking,
     StackingSettings,
     films,
+    load_shapes,
     published_split,
     shape_universe,
 )
@@ -26,6 +28,7 @@ from jaxnew.rollout.contract import Episode, RolloutConfig
 from jaxnew.sampling import SetConfig
 from jaxnew.task.budgets import LoopConfig, StageOneBudget, StageTwoBudget
 from jaxnew.task.domain import published
+from jaxnew.task.places import file_of
 from jaxnew.task.presentation import Film, Filming, Measured, Presentation
 from jaxnew.task.task import Drawing, Play, Task
 
@@ -137,23 +140,25 @@ _STAGE_TWO = {
     ),
 }
 
-_PLAY = Play(
-    format=RecordingFormat("Shape Stacking play, viewpoints", (2,), "float32"),
-    record_block=record_block,
-    block_actions=810,
-    modalities={"image": image_modality("image", PICTURE_SHAPE, is_still=True)},
-    drawing=Drawing(
-        format=RecordingFormat("Shape Stacking play, pictures", PICTURE_SHAPE, "uint8"),
-        draw=draw_pictures,
-        folder="pictures",
-    ),
-    folder="viewpoints",
-)
+
+def _play(shapes: tuple[Shape, ...]) -> Play:
+    return Play(
+        format=RecordingFormat("Shape Stacking play, viewpoints", (2,), "float32"),
+        record_block=record_block,
+        block_actions=810,
+        modalities={"image": image_modality("image", PICTURE_SHAPE, is_still=True)},
+        drawing=Drawing(
+            format=RecordingFormat("Shape Stacking play, pictures", PICTURE_SHAPE, "uint8"),
+            draw=partial(draw_pictures, shapes=shapes),
+            folder="pictures",
+        ),
+        folder="viewpoints",
+    )
 
 
 def _draw(env: Any, episode: Episode, *, size: int) -> Film:
     shown = films.seen(env, episode.states, episode.actions)
-    page = partial(films.page, shown)
+    page = partial(films.page, shown, shapes=env.shapes)
     return Film(films.draw(env, shown, size), episode.metrics, page)
 
 
@@ -167,14 +172,16 @@ _FILMING = Filming(
 )
 
 
-def _task(variant: str, position_dim: int, paper_variant: str) -> Task:
+def _task(
+    variant: str, position_dim: int, paper_variant: str, shapes: tuple[Shape, ...] = ()
+) -> Task:
     return Task(
         name=f"shape_stacking{variant}",
-        make_environment=partial(ShapeStacking, position_dim=position_dim),
+        make_environment=partial(ShapeStacking, position_dim=position_dim, shapes=shapes),
         environment=StackingSettings(),
-        make_universe=shape_universe,
+        make_universe=partial(shape_universe, shapes),
         splits={name: published(partial(published_split, name)) for name in ("default", "full")},
-        plays=(_PLAY,),
+        plays=(_play(shapes),),
         stage_one=_STAGE_ONE,
         stage_two=_STAGE_TWO,
         selection_metric="final_height",
@@ -186,8 +193,16 @@ def _task(variant: str, position_dim: int, paper_variant: str) -> Task:
             filming=_FILMING,
             anchors="experiments.untrained.stacking:measure_anchors",
         ),
+        other_universes=partial(_with_shapes, variant, position_dim, paper_variant),
         actions_name="shape_stacking",
     )
+
+
+def _with_shapes(variant: str, position_dim: int, paper_variant: str, name: str) -> Task:
+    """The task with the shapes of a user's file behind its own."""
+    path = file_of(name, "Shape Stacking takes a CSV file: solid,scale,yaw_deg,red,green,blue.")
+    task = _task(variant, position_dim, paper_variant, load_shapes(path))
+    return replace(task, universe_name=str(path))
 
 
 TASK = _task("", 1, "")
