@@ -16,8 +16,7 @@ from jaxnew.embedding import find_table
 from jaxnew.observations import ObservationsError
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.domain import Domain, load_task
-from tests.experiments.commands import run
-from tests.experiments.several import refused
+from tests.experiments.commands import refused, run, run_alone
 
 pytestmark = pytest.mark.integration
 
@@ -74,7 +73,7 @@ def test_wrong_names_and_values(answers: dict[str, str], flag: str) -> None:
 
 @pytest.mark.parametrize("command", ["train", "sweep"])
 def test_a_wrong_method_is_named_before_anything_is_made(command: str, tmp_path: Path) -> None:
-    output = run(
+    output = run_alone(
         command,
         "--budget=smoke",
         "--representation=hvae",

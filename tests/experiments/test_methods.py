@@ -76,9 +76,9 @@ def test_methods_train_and_are_evaluated(evaluated: Path, name: tuple[str, str, 
 @pytest.mark.slow
 def test_a_fixed_set_of_5000_trains_and_is_evaluated(tmp_path: Path) -> None:
     """As users run it, for it computes a lot."""
-    run("train", *training(FULL, tmp_path), environment=OPTIMIZED)
+    run_alone("train", *training(FULL, tmp_path), environment=OPTIMIZED)
     path = tmp_path / FULL[0] / FOLDER.format(*FULL)
-    run("evaluate", f"--run={path}", *EPISODES, environment=OPTIMIZED)
+    run_alone("evaluate", f"--run={path}", *EPISODES, environment=OPTIMIZED)
     check_evaluations(path, SIZES_OF_FULL)
 
 
