@@ -11,7 +11,7 @@ from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import OPTIMIZED, read_json, run
+from tests.experiments.commands import OPTIMIZED, read_json, run, run_alone
 from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
