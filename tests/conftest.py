@@ -18,7 +18,7 @@ if _WORKER and hasattr(os, "sched_setaffinity"):  # Not on macOS.
 # Set before jax is imported. Compiled programs are kept between tests and their child processes.
 _CACHE = Path(tempfile.gettempdir()) / "jaxnew-test-cache"
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", str(_CACHE))
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.1")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PLATFORMS", "cpu")
 
 # Programs that are compiled fast rather than fast programs: most tests run theirs once. Child

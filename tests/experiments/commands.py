@@ -1,40 +1,53 @@
-"""Runs commands as a user does: in a process of their own."""
+"""Runs commands as a user does, in this process or in one of their own."""
 
 from __future__ import annotations
 
+import contextlib
+import importlib
+import io
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Mapping
+import traceback
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).resolve().parents[2]
-# Programs that are compiled fast rather than fast programs, and all of them kept on disk. Runs
-# whose bits are compared have to be of one kind.
+# Programs that are compiled fast rather than fast programs. Runs whose bits are compared have to be
+# of one kind.
 ENVIRONMENT = {
     "XLA_FLAGS": "--xla_cpu_use_fusion_emitters=false",
     "JAX_DISABLE_MOST_OPTIMIZATIONS": "1",
-    "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
 }
 # For runs that compute a lot.
 OPTIMIZED = {"XLA_FLAGS": "", "JAX_DISABLE_MOST_OPTIMIZATIONS": "0"}
 
 
-def run(
-    *arguments: str | Path, fails: bool = False, environment: Mapping[str, str] = ENVIRONMENT
-) -> str:
-    """Output (stdout and stderr) of `python -m experiments.ARGUMENTS`; checks the exit status.
+def run(*arguments: str | Path, fails: bool = False) -> str:
+    """Output (stdout and stderr) of `python -m experiments.ARGUMENTS`; checks how it ends.
+
+    It runs in this process, which has imported JAX and compiled much of what it needs; see
+    `run_alone`.
 
     Args:
       arguments: the module, and its flags.
       fails: whether the command ends with an error, which is then told without a traceback.
-      environment: variables of the process, beside those of this one.
     """
     module, *flags = map(str, arguments)
+    output, has_failed = as_user(module, flags)
+    return _checked(flags, output, has_failed, fails)
+
+
+def run_alone(
+    *arguments: str | Path, fails: bool = False, environment: Mapping[str, str] = ENVIRONMENT
+) -> str:
+    """`run` in a process of its own, with these variables beside those of this one."""
+    module, *flags = map(str, arguments)
     done = subprocess.run(
-        [sys.executable, "-m", f"experiments.{module}", *flags],
+        command_line(module, *flags),
         cwd=ROOT,
         env={**os.environ, **environment},
         capture_output=True,
@@ -42,8 +55,43 @@ def run(
         timeout=400,
         check=False,
     )
-    output = done.stdout + done.stderr
-    assert (done.returncode != 0) == fails, output
+    return _checked(flags, done.stdout + done.stderr, done.returncode != 0, fails)
+
+
+def command_line(module: str, *flags: str) -> list[str]:
+    return [sys.executable, "-m", f"experiments.{module}", *flags]
+
+
+def as_user(module: str, flags: Sequence[str]) -> tuple[str, bool]:
+    """What a user reads of a command in this process, and whether it ends with an error."""
+    command: Any = importlib.import_module(f"experiments.{module}")
+    text = io.StringIO()
+    with (
+        mock.patch.object(sys, "orig_argv", command_line(module, *flags)),
+        contextlib.chdir(ROOT),
+        contextlib.redirect_stdout(text),
+        contextlib.redirect_stderr(text),
+    ):
+        try:
+            command.ARGUMENTS.start(command.main, list(flags))
+        except SystemExit as end:
+            # As the interpreter does it: a text is printed, and is an error.
+            if isinstance(end.code, str):
+                print(end.code)
+            return text.getvalue(), bool(end.code)
+        except Exception:
+            traceback.print_exc()
+            return text.getvalue(), True
+    return text.getvalue(), False
+
+
+def refused(module: str, jobs: Iterable[Sequence[str | Path]]) -> list[str]:
+    """What a user reads of a command that refuses each job."""
+    return [run(module, *job, fails=True) for job in jobs]
+
+
+def _checked(flags: Sequence[str], output: str, has_failed: bool, fails: bool) -> str:
+    assert has_failed == fails, f"{flags}: {output}"
     assert not fails or "Traceback" not in output, output
     return output
 

@@ -1,4 +1,8 @@
-"""What tests watch and do in the processes that run CREATE's commands; see `several`."""
+"""What tests watch and do in the processes that run CREATE's commands; see `several`.
+
+Also what makes them fast enough for tests: jobs whose programs are equal share them. And as whole
+images are convolved at every decision, programs are worth optimizing (`OPTIMIZED`).
+"""
 
 from __future__ import annotations
 
@@ -14,8 +18,48 @@ from unittest import mock
 import numpy as np
 
 from envs_host.pool import HostPool
+from jaxnew import trainer
+from jaxnew.ppo import Learner
+from jaxnew.rollout.host import HostRollout
+from jaxnew.trainer import rollout_of
 
 FATAL = {"in-evaluation": 30, "in-update": 12}
+_COMPILED = ("act", "value", "project", "draw_next")
+_rollouts: dict[Any, HostRollout] = {}
+_learners: dict[Any, Learner] = {}
+
+
+@contextlib.contextmanager
+def sharing() -> Iterator[None]:
+    """Runs of `ours` with equal configs share their compiled functions, and nothing else."""
+    with (
+        mock.patch.object(trainer, "rollout_of", _with_shared_functions),
+        mock.patch.object(trainer, "Learner", _learner_with_shared_functions),
+    ):
+        yield
+
+
+def _with_shared_functions(task: Any, method: Any, config: Any, *others: Any) -> Any:
+    rollout: Any = rollout_of(task, method, config, *others)
+    if method.name == "ours":
+        first: Any = _rollouts.setdefault(_kind_of(method, config), rollout)
+        rollout.__dict__.update({name: getattr(first, name) for name in _COMPILED})
+        for name in ("_act", "_project"):
+            setattr(rollout._player, name, getattr(first._player, name))
+    return rollout
+
+
+def _learner_with_shared_functions(rollout: Any, config: Any) -> Learner:
+    learner: Any = Learner(rollout, config)
+    if rollout.method.name == "ours":
+        first = _learners.setdefault(_kind_of(rollout.method, config), learner)
+        learner.__dict__["_compiled_learn"] = first._compiled_learn
+    return learner
+
+
+def _kind_of(method: Any, config: Any) -> Any:
+    """What compiled functions depend on, beside shapes."""
+    return method._is_conditioned, config
 
 
 @contextlib.contextmanager
@@ -34,7 +78,7 @@ def acted_ids(job: list[str]) -> Iterator[None]:
         pools.add(pool)
         send(pool, half, chosen, positions)
 
-    with mock.patch.object(HostPool, "send", noting):
+    with mock.patch.object(HostPool, "send", noting), sharing():
         yield
     restarts = {pool._workers._max_restarts for pool in pools}
     left_open = sum(not pool._workers.why_closed for pool in pools)
@@ -76,5 +120,6 @@ def killing(job: list[str]) -> Iterator[None]:
     with (
         mock.patch.object(HostPool, "send", counting),
         mock.patch.object(HostPool, "load_state", noting),
+        sharing(),
     ):
         yield

@@ -1,7 +1,7 @@
 """Runs one command several times in one new process: `python -m tests.experiments.several`.
 
 Starting Python, importing JAX and compiling take most of a smoke run's time, and are paid once
-here. `run_several` starts it, and `refused` where the command is to fail.
+here. `run_several` starts it.
 """
 
 from __future__ import annotations
@@ -21,8 +21,6 @@ from typing import Any
 from tests.experiments.commands import ENVIRONMENT, ROOT
 
 _FAILED = "Traceback (most recent call last)"
-_AS_USER = "as-user"  # Instead of a probe: jobs begin and end as those of a user.
-_ENDED = "ended with an error\n"
 
 
 def run_several(
@@ -47,18 +45,6 @@ def run_several(
     failed = [output for output in outputs if _FAILED in output]
     assert may_fail or not failed, "\n".join(failed)
     return outputs
-
-
-def refused(module: str, jobs: Sequence[Sequence[str | Path]]) -> list[str]:
-    """What a user reads of `python -m experiments.MODULE JOB` for each job, all in one new process.
-
-    Checks that every job ends with an error, which is told without a traceback.
-    """
-    outputs = finish_several(start_several(module, jobs, probe=_AS_USER))
-    for job, output in zip(jobs, outputs, strict=True):
-        assert output.startswith(_ENDED), f"{job} was not refused: {output}"
-        assert _FAILED not in output, output
-    return [output.removeprefix(_ENDED) for output in outputs]
 
 
 def start_several(
@@ -98,27 +84,10 @@ def main(module: str, probe: str, jobs: list[list[str]]) -> list[str]:
     command: Any = importlib.import_module(f"experiments.{module}")
     from absl import logging
 
-    if probe == _AS_USER:
-        return [_read_by_user(command, job) for job in jobs]
     place, _, name = probe.partition(":")
     around = getattr(importlib.import_module(place), name)
     logging.set_verbosity(logging.WARNING)
     return [_output(command, job, around) for job in jobs]
-
-
-def _read_by_user(command: Any, job: list[str]) -> str:
-    text = io.StringIO()
-    with contextlib.redirect_stdout(text), contextlib.redirect_stderr(text):
-        try:
-            command.ARGUMENTS.start(command.main, job)
-        except SystemExit as end:
-            # As the interpreter does it: a text is printed, and is an error.
-            if isinstance(end.code, str):
-                print(end.code)
-            return f"{_ENDED if end.code else ''}{text.getvalue()}"
-        except Exception:
-            traceback.print_exc()
-    return f"{_ENDED}{text.getvalue()}"
 
 
 def _output(command: Any, job: list[str], around: Any) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ import numpy as np
 from envs_mjx.shape_stacking import published_split
 from jaxnew.actions import ActionSplit
 from jaxnew.storage import metrics
-from tests.experiments.commands import read_json
+from tests.experiments.commands import OPTIMIZED, read_json
 from tests.experiments.several import run_several
 from tests.experiments.stacking_probes import EPISODES
 
@@ -92,7 +92,7 @@ def embed(runs: Path, names: Iterable[str], *flags: str) -> list[str]:
                 *flags,
             )
         )
-    return run_several("embed", jobs)
+    return run_several("embed", jobs, environment=OPTIMIZED)
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
@@ -103,13 +103,14 @@ def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
     return dict(zip(names, outputs, strict=True))
 
 
-def evaluate(runs: Path, names: Iterable[str], *flags: str) -> dict[str, str]:
-    """What `evaluate` prints for each of `RUNS`, on train and test shapes, in another process."""
-    names = list(names)
-    common = ("--sets=train,test", f"--episodes={EPISODES}", *flags)
-    jobs = [(f"--run={runs / name}", *common) for name in names]
-    outputs = run_several("evaluate", jobs, probe=WATCHED)
-    return dict(zip(names, outputs, strict=True))
+def evaluate(runs: Path, names: Iterable[str], more: Mapping[str, Sequence[str]]) -> dict[str, str]:
+    """What `evaluate` prints in another process, and for more jobs.
+
+    For each of `RUNS` on train and test shapes.
+    """
+    jobs = {name: (f"--run={runs / name}", "--sets=train,test") for name in names} | dict(more)
+    flags = [(*job, f"--episodes={EPISODES}") for job in jobs.values()]
+    return dict(zip(jobs, run_several("evaluate", flags, probe=WATCHED), strict=True))
 
 
 def evaluation(path: Path, name: str = "test") -> dict[str, Any]:

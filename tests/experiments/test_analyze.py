@@ -19,7 +19,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.embedding import Encoder
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import run
+from tests.experiments.commands import run, run_alone
 from tests.experiments.several import run_several
 
 POLICY = "ours-hvae-relative-default-smoke-31"
@@ -115,7 +115,7 @@ def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> Non
 @pytest.mark.integration
 def test_a_grid_is_searched_by_validation(tmp_path: Path) -> None:
     common = ("--representation=gt12", "--budget=smoke", "--seeds=1,2", f"--runs={tmp_path}")
-    output = run("analyze", "--study=entropy", "--values=0.01,0.1", *common)
+    output = run_alone("analyze", "--study=entropy", "--values=0.01,0.1", *common)
     assert "4 runs of 1.02 k steps in one program" in output
     rows = rows_of(tmp_path / "grid_world" / "analysis" / "entropy.csv")
     assert [row["entropy coefficient"] for row in rows] == ["0.01", "0.1"]
@@ -125,6 +125,6 @@ def test_a_grid_is_searched_by_validation(tmp_path: Path) -> None:
     of_first = [m for m in members if m["entropy_coefficient"] == 0.01]
     assert float(rows[0]["mean"]) == pytest.approx(np.mean([m["best_metric"] for m in of_first]))
     # One size is one program: 4 minibatches of 64 transitions are 32 steps of 8 environments.
-    output = run("analyze", "--study=batch-size", "--values=128", *common)
+    output = run_alone("analyze", "--study=batch-size", "--values=128", *common)
     assert "--set=ppo.rollout.num_steps=64 --set=num_updates=2" in output
     assert "Chosen by it: transitions per minibatch 128" in output

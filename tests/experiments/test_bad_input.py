@@ -18,8 +18,7 @@ from jaxnew.observations import ObservationsError
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import run
-from tests.experiments.several import refused
+from tests.experiments.commands import refused, run, run_alone
 
 pytestmark = pytest.mark.integration
 
@@ -78,7 +77,7 @@ def test_wrong_names_and_values(answers: dict[str, str], flag: str) -> None:
 
 @pytest.mark.parametrize("command", ["train", "sweep"])
 def test_a_wrong_method_is_named_before_anything_is_made(command: str, tmp_path: Path) -> None:
-    output = run(
+    output = run_alone(
         command,
         "--budget=smoke",
         "--representation=hvae",

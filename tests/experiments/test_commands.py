@@ -1,4 +1,4 @@
-"""Every command at smoke budget, each in a process of its own."""
+"""Every command at smoke budget, as a user calls it."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ import random
 import re
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,7 @@ from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.domain import Domain, load_task
-from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
+from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json, run, run_alone
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several
 
@@ -170,7 +169,7 @@ def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path
     common = ("--budget=smoke", f"--runs={runs}")
     names = ("hvae-relative", "hvae-onehot-oracle", "vae")
     jobs = [(*common, f"--representation={name}") for name in names]
-    outputs = run_several("embed", jobs)
+    outputs = [run("embed", *job) for job in jobs]
     assert "already complete" in outputs[0]
     numbers = read_json(encoder_run / "evaluation" / "representation.json")
     assert 0.0 <= numbers["purity_held_out"] <= 1.0
@@ -193,7 +192,7 @@ def test_train_makes_what_it_needs(tmp_path: Path) -> None:
 
 
 def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
-    run(
+    run_alone(
         "train",
         "--budget=smoke",
         "--representation=hvae",
@@ -204,7 +203,7 @@ def test_no_random_key_is_used_twice(tmp_path: Path) -> None:
 
 
 def test_a_sweep_is_read_back_and_its_members_are_ordinary_runs(runs: Path) -> None:
-    output = run(
+    output = run_alone(
         "sweep",
         "--budget=smoke",
         "--representation=gt5",
@@ -258,7 +257,7 @@ def test_a_killed_run_resumes_to_the_same_bits(runs: Path) -> None:
     calm, killed = runs / "calm", runs / "killed"
     run("train", *flags, f"--workdir={calm}")
     rng = random.Random(0)
-    command = [sys.executable, "-m", "experiments.train", *flags, f"--workdir={killed}"]
+    command = command_line("train", *flags, f"--workdir={killed}")
     kills = 0
     while kills < 3:
         process = subprocess.Popen(

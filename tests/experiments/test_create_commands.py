@@ -31,7 +31,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import read_json
+from tests.experiments.commands import OPTIMIZED, read_json
 from tests.experiments.create_probes import acted
 from tests.experiments.create_runs import parameters
 from tests.experiments.several import run_several
@@ -99,7 +99,7 @@ def embed(folder: Path, *names: str) -> None:
         # As many as a step of training takes; most of the time is for recording 2,366 tools.
         flags = (*flags, "--recordings=2")
         jobs.append(("--task=create-push", "--budget=smoke", *flags))
-    run_several("embed", jobs)
+    run_several("embed", jobs, environment=OPTIMIZED)
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
@@ -111,14 +111,15 @@ def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
         representation = given if given.exists() else run.representation
         flags = (f"--representation={representation}", f"--workdir={runs / name}", *run.flags)
         jobs.append((f"--task={run.task}", f"--method={run.method}", *COMMON, *flags))
-    return dict(zip(names, run_several("train", jobs, probe=ACTED_IDS), strict=True))
+    outputs = run_several("train", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
+    return dict(zip(names, outputs, strict=True))
 
 
 def evaluate(runs: Path, names: Iterable[str], more: Mapping[str, Job]) -> dict[str, str]:
     """What `evaluate` prints for each of `RUNS` on its test tools, and for more jobs."""
     common = (f"--episodes={EPISODES}", "--workers=1")
     jobs = [*((f"--run={runs / name}", *common) for name in names), *more.values()]
-    outputs = run_several("evaluate", jobs, probe=ACTED_IDS)
+    outputs = run_several("evaluate", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
     return dict(zip([*names, *more], outputs, strict=True))
 
 
@@ -320,7 +321,7 @@ def test_finetuning_of_each_kind(
         flags = ("--seed=7", *POOL, *(["--scratch"] if start == "scratch" else []))
         workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
         jobs.append((f"--run={runs / SOURCES[method]}", *COMMON, *flags, workdir))
-    outputs = run_several("finetune", jobs, probe=ACTED_IDS)
+    outputs = run_several("finetune", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
     split = published_split()
     test = {*split.test.tolist(), *split.always_available.tolist()}
     for (method, start), output in zip(kinds, outputs, strict=True):
@@ -371,7 +372,7 @@ def test_studies_of_the_analysis(
         )
         for name in names
     ]
-    outputs = run_several("analyze", jobs, probe=ACTED_IDS)
+    outputs = run_several("analyze", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
     table = RepresentationTable.load(path / "table.npz").vectors
     for name, output in zip(names, outputs, strict=True):
         value, expected = STUDIES[name]

@@ -12,7 +12,7 @@ import pytest
 
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import ENVIRONMENT, ROOT, read_json
+from tests.experiments.commands import OPTIMIZED, ROOT, command_line, read_json
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several
 
@@ -28,11 +28,10 @@ TWICE, ONCE = "killed-in-evaluation-and-in-update", "killed-in-update"
 def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A run of two updates that SIGTERM stops during the evaluation after the first."""
     path = tmp_path_factory.mktemp("runs") / "stopped"
-    command = [sys.executable, "-m", "experiments.train", *COMMON, f"--workdir={path}"]
     process = subprocess.Popen(
-        [*command, "--workers=1"],
+        command_line("train", *COMMON, f"--workdir={path}", "--workers=1"),
         cwd=ROOT,
-        env={**os.environ, **ENVIRONMENT},
+        env={**os.environ, **OPTIMIZED},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -61,7 +60,8 @@ def outputs(stopped: Path) -> dict[str, str]:
         "retried": (ONCE, "--workers=2", RESTART),
     }
     flags = [(*COMMON, f"--workdir={runs / name}", *more) for name, *more in jobs.values()]
-    return dict(zip(jobs, run_several("train", flags, probe=KILLING, may_fail=True), strict=True))
+    printed = run_several("train", flags, probe=KILLING, may_fail=True, environment=OPTIMIZED)
+    return dict(zip(jobs, printed, strict=True))
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +71,8 @@ def evaluated(stopped: Path, outputs: dict[str, str]) -> dict[str, str]:
     names = ("calm", "stopped", TWICE)
     common = ("--episodes=12", "--workers=2", RESTART)
     jobs = [(f"--run={stopped.parent / name}", *common) for name in names]
-    return dict(zip(names, run_several("evaluate", jobs, probe=KILLING), strict=True))
+    printed = run_several("evaluate", jobs, probe=KILLING, environment=OPTIMIZED)
+    return dict(zip(names, printed, strict=True))
 
 
 @pytest.mark.parametrize("name", ["two", "stopped", TWICE, ONCE])

@@ -1,11 +1,10 @@
-"""The commands on a domain whose environments run on the host, each in a process of its own."""
+"""The commands on a domain whose environments run on the host."""
 
 from __future__ import annotations
 
 import os
 import signal
 import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from jaxnew.run import Run
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.task import Task
-from tests.experiments.commands import ENVIRONMENT, ROOT, read_json, run
+from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json, run, run_alone
 from tests.experiments.create_runs import saved, timeless
 from tests.toy_task import TASK
 
@@ -40,8 +39,8 @@ def test_train_save_and_evaluate_in_a_new_process(trained: Path) -> None:
     assert any("validation/is_success" in line for line in lines)
     assert any("time/rollout_s" in line for line in lines)
     results = []
-    for _ in range(2):
-        run("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7")
+    for evaluate in (run, run_alone):
+        evaluate("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7")
         results.append(read_json(trained / "evaluation" / "test-best-sampled-m4.json"))
     assert results[0]["metrics"] == results[1]["metrics"]
     assert (results[0]["num_actions"], results[0]["num_episodes"]) == (6, 7)
@@ -76,7 +75,7 @@ def test_a_method_with_a_fixed_set_trains_and_is_evaluated(tmp_path: Path) -> No
 
 def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) -> None:
     killed = tmp_path / "killed"
-    command = [sys.executable, "-m", "experiments.train", *COMMON, f"--workdir={killed}"]
+    command = command_line("train", *COMMON, f"--workdir={killed}")
     process = subprocess.Popen(
         command,
         cwd=ROOT,
@@ -98,7 +97,7 @@ def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) ->
 
 
 def test_sweep_says_what_to_do(tmp_path: Path) -> None:
-    output = run("sweep", *COMMON, f"--runs={tmp_path}", fails=True)
+    output = run_alone("sweep", *COMMON, f"--runs={tmp_path}", fails=True)
     assert "toy run on the host" in output
     assert "Run `train` once per seed" in output
     assert not list(tmp_path.iterdir())

@@ -11,7 +11,7 @@ from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import OPTIMIZED, read_json, run
+from tests.experiments.commands import OPTIMIZED, read_json, run, run_alone
 from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
@@ -76,9 +76,9 @@ def test_methods_train_and_are_evaluated(evaluated: Path, name: tuple[str, str, 
 @pytest.mark.slow
 def test_a_fixed_set_of_5000_trains_and_is_evaluated(tmp_path: Path) -> None:
     """As users run it, for it computes a lot."""
-    run("train", *training(FULL, tmp_path), environment=OPTIMIZED)
+    run_alone("train", *training(FULL, tmp_path), environment=OPTIMIZED)
     path = tmp_path / FULL[0] / FOLDER.format(*FULL)
-    run("evaluate", f"--run={path}", *EPISODES, environment=OPTIMIZED)
+    run_alone("evaluate", f"--run={path}", *EPISODES, environment=OPTIMIZED)
     check_evaluations(path, SIZES_OF_FULL)
 
 

@@ -19,6 +19,7 @@ from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
+from tests.experiments import commands
 from tests.experiments import stacking_runs as stacking
 from tests.experiments.commands import read_json
 from tests.experiments.create_runs import parameters, saved, timeless
@@ -72,15 +73,35 @@ def trained_others(encoders: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def evaluated_alike(runs: Path, trained_alike: dict[str, str]) -> dict[str, str]:
+def encoded(runs: Path) -> dict[str, Path]:
+    """Tables of eight test shapes, from the pictures that are known and from new ones."""
+    ids = published_split().test[:8]
+    tables = {}
+    for name, seed in {"known": REPRESENTATION_SEED, "new": 7}.items():  # Of the viewpoints.
+        tables[name] = runs / f"{name}_table.npz"
+        views = np.tile(np.stack(viewpoints(seed, 1), axis=-1), (len(ids), 1))
+        pictures = draw_pictures(ids, views)[:, None]
+        np.savez(runs / f"{name}.npz", ids=ids, recordings=pictures)
+        files = (f"--observations={runs / name}.npz", f"--output={tables[name]}")
+        output = commands.run("embed", f"--checkpoint={runs / EMBED.format('hvae')}", *files)
+        assert f"8 actions, {WIDTH} numbers each" in output
+    return tables
+
+
+@pytest.fixture(scope="module")
+def evaluated_alike(
+    runs: Path, trained_alike: dict[str, str], encoded: dict[str, Path]
+) -> dict[str, str]:
+    """Also of `line` with new pictures."""
     assert trained_alike
-    return stacking.evaluate(runs, ALIKE)
+    with_new = (f"--run={runs / 'line'}", f"--table={encoded['new']}")
+    return stacking.evaluate(runs, ALIKE, {"line with new pictures": with_new})
 
 
 @pytest.fixture(scope="module")
 def evaluated_others(runs: Path, trained_others: dict[str, str]) -> dict[str, str]:
     assert trained_others
-    return stacking.evaluate(runs, OTHERS)
+    return stacking.evaluate(runs, OTHERS, {})
 
 
 @pytest.fixture
@@ -178,36 +199,23 @@ def test_the_encoder_describes_every_shape(runs: Path) -> None:
 
 
 def test_new_pictures_are_encoded_and_acted_with(
-    runs: Path, trained_alike: dict[str, str], tmp_path: Path
+    runs: Path, encoded: dict[str, Path], evaluated_alike: dict[str, str]
 ) -> None:
     """Paper algorithm 2: pictures of shapes that the encoder never saw, and nothing trained."""
-    assert trained_alike
     ids = published_split().test[:8]
-    seeds = {"known": REPRESENTATION_SEED, "new": 7}  # Of the viewpoints.
-    tables = {name: tmp_path / f"{name}_table.npz" for name in seeds}
-    jobs = []
-    for name, seed in seeds.items():
-        views = np.tile(np.stack(viewpoints(seed, 1), axis=-1), (len(ids), 1))
-        pictures = draw_pictures(ids, views)[:, None]
-        np.savez(tmp_path / f"{name}.npz", ids=ids, recordings=pictures)
-        files = (f"--observations={tmp_path / name}.npz", f"--output={tables[name]}")
-        jobs.append((f"--checkpoint={runs / EMBED.format('hvae')}", *files))
     stored = np.load(runs / "shape_stacking" / "pictures-1" / "recordings.npy", mmap_mode="r")
-    drawn = np.load(tmp_path / "known.npz")["recordings"]
+    drawn = np.load(runs / "known.npz")["recordings"]
     # Rounded by other programs.
     assert np.abs(drawn.astype(int) - stored[ids]).max() <= 1
-    outputs = run_several("embed", jobs)
-    found = {name: RepresentationTable.load(path) for name, path in tables.items()}
+    found = {name: RepresentationTable.load(path) for name, path in encoded.items()}
     own = RepresentationTable.load(runs / EMBED.format("hvae") / "table.npz").rows(np.sort(ids))
-    for output, table in zip(outputs, found.values(), strict=True):
-        assert f"8 actions, {WIDTH} numbers each" in output
+    for table in found.values():
         np.testing.assert_array_equal(table.ids, np.sort(ids))
     off = {name: np.abs(table.vectors - own).max() for name, table in found.items()}
     assert off["known"] < 0.1 * off["new"], "the same pictures, and others"
-    job = (f"--run={runs / 'line'}", f"--table={tables['new']}", f"--episodes={EPISODES}")
-    (output,) = run_several("evaluate", [job], probe=WATCHED)
-    assert seen(output).placed
-    assert seen(output).placed <= {*ids.tolist()}
+    engine = seen(evaluated_alike["line with new pictures"])
+    assert engine.placed
+    assert engine.placed <= {*ids.tolist()}
     result = evaluation(runs / "line", "table-new_table")
     assert (result["num_actions"], result["num_episodes"]) == (8, EPISODES)
     check_heights({name: row["mean"] for name, row in result["metrics"].items()})
