@@ -27,7 +27,7 @@ LAYERS = (
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
-    {"embedding", "trainer", "run", "training", "sweeping"},
+    {"embedding", "trainer", "run", "runs", "training", "sweeping"},
 )
 SIDEWAYS = {
     "observations": {"actions", "storage"},
@@ -35,7 +35,8 @@ SIDEWAYS = {
     "ppo": {"rollout"},
     "run": {"embedding", "trainer"},
     "training": {"embedding", "run", "trainer"},
-    "sweeping": {"run", "trainer", "training"},
+    "runs": {"run"},
+    "sweeping": {"runs", "trainer", "training"},
 }
 
 # Of `experiments`, lowest first; commands and benchmarks are above them.
