@@ -72,7 +72,7 @@ def sweep_figure(runs: Runs, out: Path, stem: str = "sweep", pdf: bool = False) 
         _metric(runs),
         tuple(points),
         "",
-        place=runs.task.name,
+        place=runs.task.name.replace("_", " "),
     )
     return plots.save(study_figure(study), out / f"{stem}.png", pdf)
 

@@ -86,6 +86,8 @@ class ProgressDisplay:
         while not self._has_ended.wait(_MOVES_EVERY_S):
             done, since = self._now
             waited = time.monotonic() - since
+            if done >= self._total:
+                continue
             if self._rate:
                 moved = min(self._rate * waited, 0.99 * self._step)
                 self._show(done + moved, self._note, "about ")

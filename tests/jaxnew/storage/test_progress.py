@@ -23,6 +23,7 @@ def test_it_moves_within_a_chunk(
         time.sleep(0.3)  # At that rate it would be past 20.
         display.update(20)
         display.update(30)
+        time.sleep(0.1)  # Such as a last evaluation.
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "job: 0/30 updates  compiling"
     assert "job: 0/30 updates  compiling for 0:00" in lines
@@ -32,3 +33,4 @@ def test_it_moves_within_a_chunk(
     assert places[0] < places[-1] == 19  # No further than the last chunk went.
     assert all(line.endswith(" left  fast") for line in about)
     assert lines[-1].startswith("job: 30/30 updates")
+    assert lines[-2].startswith("job: 20/30 updates")
