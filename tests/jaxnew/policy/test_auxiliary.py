@@ -307,6 +307,7 @@ def learned(is_conditioned: bool) -> dict[str, float]:
 
 
 @pytest.mark.learning
+@pytest.mark.optimized
 def test_a_place_that_depends_on_the_choice_needs_the_conditioned_head() -> None:
     """Half of the episodes ask for a stop, and both heads learn it. In the others every action
     belongs elsewhere: one place for all is at best near one of a set's few good actions."""
