@@ -96,6 +96,22 @@ def _checked(flags: Sequence[str], output: str, has_failed: bool, fails: bool) -
     return output
 
 
+def of_new_actions(section: str, runs: Path, paths: Mapping[str, Path]) -> list[list[str]]:
+    """The commands that `docs/new_actions.md` shows in a section, at smoke budget.
+
+    Args:
+      runs: in place of `runs/`.
+      paths: in place of run directories that the page names.
+    """
+    page = (ROOT / "docs" / "new_actions.md").read_text()
+    block = page.partition(f"\n## {section}")[2].partition("```shell\n")[2].partition("```")[0]
+    for shown, path in paths.items():
+        assert shown in block, shown
+        block = block.replace(shown, str(path))
+    block = block.replace("=runs/", f"={runs}/").replace("--budget=laptop", "--budget=smoke")
+    return [line.split()[1:] for line in block.splitlines()]
+
+
 def read_json(path: Path) -> Any:
     """What a JSON file holds."""
     return json.loads(path.read_text())

@@ -92,7 +92,7 @@ def embed(runs: Path, names: Iterable[str], *flags: str) -> list[str]:
                 *flags,
             )
         )
-    return run_several("embed", jobs, environment=OPTIMIZED)
+    return run_several("embed", jobs)
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:

@@ -9,6 +9,7 @@ import re
 import signal
 import subprocess
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,12 +17,18 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from jaxnew import collection
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from jaxnew.task.domain import Domain, load_task
-from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json, run, run_alone
+from tests.experiments.commands import (
+    ENVIRONMENT,
+    ROOT,
+    command_line,
+    of_new_actions,
+    read_json,
+    run,
+    run_alone,
+)
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several
 
@@ -106,38 +113,71 @@ def test_evaluate_on_a_checkpoint_ids_a_mixture_and_greedily(
     assert (found["num_actions"], found["set_size"]) == (128 + 256, 20)
 
 
+@pytest.fixture(scope="module")
+def page(hvae_run: Path, runs: Path) -> list[list[str]]:
+    """Commands of the page on new actions, with the encoder and the run of these tests."""
+    assert hvae_run
+    names = ("embed-hvae-relative-default-{}-31", "ours-hvae-relative-default-{}-31")
+    folder = runs / "grid_world"
+    paths = {
+        f"runs/grid_world/{name.format('laptop')}": folder / name.format("smoke") for name in names
+    }
+    return of_new_actions("Grid World", runs, paths)
+
+
 def test_new_actions_are_recorded_encoded_and_acted_with(
-    hvae_run: Path, encoder_run: Path, tmp_path: Path
+    hvae_run: Path, runs: Path, page: list[list[str]]
 ) -> None:
-    """Paper algorithm 2 from recordings to episodes, with nothing trained."""
-    domain = Domain.of(load_task("grid_world"))
-    ids = domain.split.test[:64]
-    recorded = collection.collect(
-        tmp_path / "recordings",
-        domain.play.record_block,
-        format=domain.play.format,
-        universe=domain.universe,
-        ids=ids,
-        num_recordings=8,
-        seed=7,
-        block_actions=64,
-    )
-    recorded.save(tmp_path / "new.npz")
-    table_file = tmp_path / "new_table.npz"
-    output = run(
-        "embed",
-        f"--checkpoint={encoder_run}",
-        f"--observations={tmp_path / 'new.npz'}",
-        f"--output={table_file}",
-    )
-    assert "64 actions, 16 numbers each" in output
-    new = RepresentationTable.load(table_file)
-    np.testing.assert_array_equal(new.ids, np.sort(ids))
-    own = RepresentationTable.load(encoder_run / "table.npz").rows(new.ids)
-    assert not np.array_equal(new.vectors, own), "other recordings give other vectors"
-    run("evaluate", f"--run={hvae_run}", f"--table={table_file}", "--episodes=32")
-    found = read_json(hvae_run / "evaluation" / "table-new_table-best-sampled-m50.json")
-    assert found["num_actions"] == 64
+    """Paper algorithm 2, as the page shows it: nothing is trained."""
+    assert [words[0] for words in page[:2]] == ["embed", "train"]
+    outputs = [run(*words, *(["--episodes=32"] * (words[0] == "evaluate"))) for words in page[2:]]
+    assert "100 actions x 16 recordings" in outputs[0]
+    assert "100 actions, 16 numbers each" in outputs[1]
+    first = (ROOT / "examples" / "skills.txt").read_text().split()[0]
+    assert f"100 actions of GridWorld-v0, 0 seen in training, e.g. {first}; " in outputs[2]
+    found = read_json(hvae_run / "evaluation" / "table-new_skills_table-best-sampled-m50.json")
+    assert (found["num_actions"], found["num_seen"], found["num_episodes"]) == (100, 0, 32)
+    table = RepresentationTable.load(runs / "new_skills_table.npz")
+    assert table.ids.tolist() == list(range(1024, 1124))
+
+
+def test_new_actions_that_are_mistaken_are_refused(
+    hvae_run: Path, encoder_run: Path, runs: Path, page: list[list[str]], tmp_path: Path
+) -> None:
+    """Renumbered ids, another encoder, another universe."""
+    mine = tmp_path / "mine.npz"
+    arrays = dict(np.load(runs / "new_skills.npz"))
+    renumbered = np.arange(100)
+    encode = ("embed", f"--checkpoint={encoder_run}", f"--observations={mine}")
+    evaluate = ("evaluate", f"--run={hvae_run}", f"--table={tmp_path / 'table.npz'}")
+    np.savez(mine, **{**arrays, "ids": renumbered})
+    output = run(*encode, f"--output={tmp_path / 'table.npz'}", fails=True)
+    assert "was edited: its ids and recordings hash to" in output
+    np.savez(mine, ids=renumbered, recordings=arrays["recordings"])
+    run(*encode, f"--output={tmp_path / 'table.npz'}")
+    output = run(*evaluate, fails=True)
+    assert "does not say what its actions are" in output
+    assert "allow unknown-actions" in output
+    run(*evaluate, "--allow=unknown-actions", "--episodes=8")
+    table = RepresentationTable.load(runs / "new_skills_table.npz")
+    replace(table, encoder_hash="0" * 16).save(tmp_path / "table.npz")
+    output = run(*evaluate, fails=True)
+    assert "is of encoder 0000000000000000, the policy learned with" in output
+    table.save(tmp_path / "table.npz")
+    skills = tmp_path / "skills.txt"
+    skills.write_text("RR.RR\n.DDDD\n")
+    output = run(*evaluate, f"--universe={skills}", fails=True)
+    assert "describes 100 actions of GridWorld-v0; GridWorld-v0 lacks 100 of them" in output
+    skills.write_text("RR.R\n")
+    output = run("collect", f"--universe={skills}", f"--output={mine}", fails=True)
+    assert "'RR.R' is not a skill" in output
+    output = run("collect", "--universe=nowhere.txt", f"--output={mine}", fails=True)
+    assert "There is no file 'nowhere.txt'. Grid World takes a text file" in output
+    output = run("collect", "--ids=test", fails=True)
+    assert "--ids: of no meaning without --output" in output
+    output = run("evaluate", f"--run={hvae_run}", "--allow=unknown-actions", fails=True)
+    assert "--allow: of no meaning without --table" in output
+    assert page
 
 
 def test_train_again_finds_the_run_complete(hvae_run: Path, runs: Path) -> None:

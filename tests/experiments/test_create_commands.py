@@ -31,7 +31,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import OPTIMIZED, read_json
+from tests.experiments.commands import OPTIMIZED, ROOT, of_new_actions, read_json, run
 from tests.experiments.create_probes import acted
 from tests.experiments.create_runs import parameters
 from tests.experiments.several import run_several
@@ -99,7 +99,7 @@ def embed(folder: Path, *names: str) -> None:
         # As many as a step of training takes; most of the time is for recording 2,366 tools.
         flags = (*flags, "--recordings=2")
         jobs.append(("--task=create-push", "--budget=smoke", *flags))
-    run_several("embed", jobs, environment=OPTIMIZED)
+    run_several("embed", jobs)
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
@@ -111,7 +111,7 @@ def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
         representation = given if given.exists() else run.representation
         flags = (f"--representation={representation}", f"--workdir={runs / name}", *run.flags)
         jobs.append((f"--task={run.task}", f"--method={run.method}", *COMMON, *flags))
-    outputs = run_several("train", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
+    outputs = run_several("train", jobs, probe=ACTED_IDS)
     return dict(zip(names, outputs, strict=True))
 
 
@@ -119,7 +119,7 @@ def evaluate(runs: Path, names: Iterable[str], more: Mapping[str, Job]) -> dict[
     """What `evaluate` prints for each of `RUNS` on its test tools, and for more jobs."""
     common = (f"--episodes={EPISODES}", "--workers=1")
     jobs = [*((f"--run={runs / name}", *common) for name in names), *more.values()]
-    outputs = run_several("evaluate", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
+    outputs = run_several("evaluate", jobs, probe=ACTED_IDS)
     return dict(zip([*names, *more], outputs, strict=True))
 
 
@@ -162,7 +162,20 @@ def evaluated_few(runs: Path, trained_few: dict[str, str]) -> dict[str, str]:
     (twin / "config.json").write_text(json.dumps(config))
     flags = ("--sets=train", "--episodes=20")
     more = {f"{name} on train": (f"--run={runs / name}", *flags) for name in ("push", "twin")}
-    return evaluate(runs, FEW, more)
+    return evaluate(runs, FEW, more | {"new tools": new_tools(runs)})
+
+
+def new_tools(runs: Path) -> Job:
+    """Records and encodes tools as the page on new actions does; the flags of its `evaluate`."""
+    paths = {
+        "runs/create/embed-hvae-state-default-laptop-31": runs / EMBED.format("hvae"),
+        "runs/create-push/ours-hvae-state-default-short-31": runs / "obstacle",
+    }
+    (_, _, collect, encode, evaluate, _) = of_new_actions("CREATE", runs, paths)
+    assert "200 actions x 4 recordings" in run(*collect)
+    assert f"200 actions, {WIDTH} numbers each" in run(*encode)
+    assert evaluate[0] == "evaluate"
+    return (*evaluate[1:], f"--episodes={EPISODES}", "--workers=1")
 
 
 @pytest.fixture(scope="module")
@@ -195,6 +208,22 @@ def evaluation(path: Path, name: str = "test") -> dict[str, Any]:
 
 def means(path: Path, name: str = "test") -> dict[str, float]:
     return {key: row["mean"] for key, row in evaluation(path, name)["metrics"].items()}
+
+
+def test_new_tools_are_recorded_encoded_and_placed(
+    runs: Path, evaluated_few: dict[str, str]
+) -> None:
+    """Paper algorithm 2: a policy of 15-degree tools with tools between them."""
+    output = evaluated_few["new tools"]
+    assert "200 actions of Create-3deg-v0, 0 seen in training, e.g. ramp e=0.1 a=3 " in output
+    ids = np.loadtxt(ROOT / "examples" / "tools_3_degrees.txt", int)
+    no_op = tool_universe(3).num_actions - 1
+    assert acted(output) <= {*ids.tolist(), no_op}
+    assert acted(output) - {no_op}
+    found = evaluation(runs / "obstacle", "table-new_tools_table")
+    assert (found["num_actions"], found["num_seen"], found["num_episodes"]) == (200, 0, EPISODES)
+    known = {*tool_universe().action_hashes}
+    assert not known & {tool_universe(3).action_hashes[i] for i in ids}
 
 
 def test_every_level_is_there() -> None:
@@ -321,7 +350,7 @@ def test_finetuning_of_each_kind(
         flags = ("--seed=7", *POOL, *(["--scratch"] if start == "scratch" else []))
         workdir = f"--workdir={tmp_path / f'{method}-{start}'}"
         jobs.append((f"--run={runs / SOURCES[method]}", *COMMON, *flags, workdir))
-    outputs = run_several("finetune", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
+    outputs = run_several("finetune", jobs, probe=ACTED_IDS)
     split = published_split()
     test = {*split.test.tolist(), *split.always_available.tolist()}
     for (method, start), output in zip(kinds, outputs, strict=True):
@@ -372,7 +401,7 @@ def test_studies_of_the_analysis(
         )
         for name in names
     ]
-    outputs = run_several("analyze", jobs, probe=ACTED_IDS, environment=OPTIMIZED)
+    outputs = run_several("analyze", jobs, probe=ACTED_IDS)
     table = RepresentationTable.load(path / "table.npz").vectors
     for name, output in zip(names, outputs, strict=True):
         value, expected = STUDIES[name]

@@ -60,7 +60,7 @@ def outputs(stopped: Path) -> dict[str, str]:
         "retried": (ONCE, "--workers=2", RESTART),
     }
     flags = [(*COMMON, f"--workdir={runs / name}", *more) for name, *more in jobs.values()]
-    printed = run_several("train", flags, probe=KILLING, may_fail=True, environment=OPTIMIZED)
+    printed = run_several("train", flags, probe=KILLING, may_fail=True)
     return dict(zip(jobs, printed, strict=True))
 
 
@@ -71,7 +71,7 @@ def evaluated(stopped: Path, outputs: dict[str, str]) -> dict[str, str]:
     names = ("calm", "stopped", TWICE)
     common = ("--episodes=12", "--workers=2", RESTART)
     jobs = [(f"--run={stopped.parent / name}", *common) for name in names]
-    printed = run_several("evaluate", jobs, probe=KILLING, environment=OPTIMIZED)
+    printed = run_several("evaluate", jobs, probe=KILLING)
     return dict(zip(names, printed, strict=True))
 
 

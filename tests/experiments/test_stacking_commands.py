@@ -13,8 +13,6 @@ import numpy as np
 import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, published_split, shape_universe
-from envs_mjx.shape_stacking.play import draw_pictures, viewpoints
-from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run
 from jaxnew.storage import metrics
@@ -73,29 +71,34 @@ def trained_others(encoders: Path) -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def encoded(runs: Path) -> dict[str, Path]:
-    """Tables of eight test shapes, from the pictures that are known and from new ones."""
-    ids = published_split().test[:8]
-    tables = {}
-    for name, seed in {"known": REPRESENTATION_SEED, "new": 7}.items():  # Of the viewpoints.
-        tables[name] = runs / f"{name}_table.npz"
-        views = np.tile(np.stack(viewpoints(seed, 1), axis=-1), (len(ids), 1))
-        pictures = draw_pictures(ids, views)[:, None]
-        np.savez(runs / f"{name}.npz", ids=ids, recordings=pictures)
-        files = (f"--observations={runs / name}.npz", f"--output={tables[name]}")
-        output = commands.run("embed", f"--checkpoint={runs / EMBED.format('hvae')}", *files)
-        assert f"8 actions, {WIDTH} numbers each" in output
-    return tables
+def page(runs: Path) -> list[list[str]]:
+    """Commands of the page on new actions, with the encoder and a run of these tests."""
+    paths = {
+        "runs/shape_stacking/embed-hvae-default-laptop-31": runs / EMBED.format("hvae"),
+        "runs/shape_stacking/ours-hvae-default-laptop-31": runs / "line",
+    }
+    return commands.of_new_actions("Shape Stacking", runs, paths)
+
+
+@pytest.fixture(scope="module")
+def encoded(runs: Path, page: list[list[str]]) -> Path:
+    """The table of the page's new shapes."""
+    (_, _, *recording, _) = page
+    for words in recording:
+        output = commands.run(*words)
+    assert f"40 actions, {WIDTH} numbers each" in output
+    return runs / "new_shapes_table.npz"
 
 
 @pytest.fixture(scope="module")
 def evaluated_alike(
-    runs: Path, trained_alike: dict[str, str], encoded: dict[str, Path]
+    runs: Path, trained_alike: dict[str, str], page: list[list[str]], encoded: Path
 ) -> dict[str, str]:
-    """Also of `line` with new pictures."""
+    """Also of `line` with new shapes."""
     assert trained_alike
-    with_new = (f"--run={runs / 'line'}", f"--table={encoded['new']}")
-    return stacking.evaluate(runs, ALIKE, {"line with new pictures": with_new})
+    _, *with_new = page[-1]
+    assert f"--table={encoded}" in with_new
+    return stacking.evaluate(runs, ALIKE, {"line with new shapes": with_new})
 
 
 @pytest.fixture(scope="module")
@@ -198,27 +201,39 @@ def test_the_encoder_describes_every_shape(runs: Path) -> None:
     assert (pictures.shape, pictures.dtype) == ((810, 1, 84, 84, 3), np.uint8)
 
 
-def test_new_pictures_are_encoded_and_acted_with(
-    runs: Path, encoded: dict[str, Path], evaluated_alike: dict[str, str]
+def test_new_shapes_are_recorded_encoded_and_stacked(
+    runs: Path, encoded: Path, evaluated_alike: dict[str, str]
 ) -> None:
-    """Paper algorithm 2: pictures of shapes that the encoder never saw, and nothing trained."""
-    ids = published_split().test[:8]
-    stored = np.load(runs / "shape_stacking" / "pictures-1" / "recordings.npy", mmap_mode="r")
-    drawn = np.load(runs / "known.npz")["recordings"]
-    # Rounded by other programs.
-    assert np.abs(drawn.astype(int) - stored[ids]).max() <= 1
-    found = {name: RepresentationTable.load(path) for name, path in encoded.items()}
-    own = RepresentationTable.load(runs / EMBED.format("hvae") / "table.npz").rows(np.sort(ids))
-    for table in found.values():
-        np.testing.assert_array_equal(table.ids, np.sort(ids))
-    off = {name: np.abs(table.vectors - own).max() for name, table in found.items()}
-    assert off["known"] < 0.1 * off["new"], "the same pictures, and others"
-    engine = seen(evaluated_alike["line with new pictures"])
+    """Paper algorithm 2: shapes that did not exist when encoder and policy were trained."""
+    table = RepresentationTable.load(encoded)
+    assert table.ids.tolist() == list(range(810, 850))
+    assert len(np.unique(table.vectors, axis=0)) == 40
+    output = evaluated_alike["line with new shapes"]
+    assert "40 actions of ShapeStacking-v0, 0 seen in training, e.g. middle_triangle" in output
+    engine = seen(output)
     assert engine.placed
-    assert engine.placed <= {*ids.tolist()}
-    result = evaluation(runs / "line", "table-new_table")
-    assert (result["num_actions"], result["num_episodes"]) == (8, EPISODES)
+    assert engine.placed <= {*table.ids.tolist()}
+    result = evaluation(runs / "line", "table-new_shapes_table")
+    assert (result["num_actions"], result["num_episodes"]) == (40, EPISODES)
     check_heights({name: row["mean"] for name, row in result["metrics"].items()})
+
+
+def test_pictures_that_are_taken_again_are_encoded_as_before(runs: Path, tmp_path: Path) -> None:
+    ids = np.sort(published_split().test[:8])
+    (tmp_path / "ids.txt").write_text(" ".join(map(str, ids)))
+    again, table = tmp_path / "again.npz", tmp_path / "table.npz"
+    of_these = (f"--ids={tmp_path / 'ids.txt'}", "--recordings=1", f"--output={again}")
+    commands.run("collect", "--task=shape_stacking", *of_these)
+    stored = np.load(runs / "shape_stacking" / "pictures-1" / "recordings.npy", mmap_mode="r")
+    # Rounded by other programs.
+    assert np.abs(np.load(again)["recordings"].astype(int) - stored[ids]).max() <= 1
+    encoder = runs / EMBED.format("hvae")
+    files = (f"--observations={again}", f"--output={table}")
+    commands.run("embed", f"--checkpoint={encoder}", *files)
+    own = RepresentationTable.load(encoder / "table.npz").vectors
+    spread = np.abs(own - own.mean(axis=0)).max()
+    found = RepresentationTable.load(table)
+    assert np.abs(found.vectors - own[ids]).max() < 0.1 * spread
 
 
 @pytest.mark.slow
