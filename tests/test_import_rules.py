@@ -303,7 +303,7 @@ def test_each_rule_is_broken_by_an_example(
         ("jaxnew/ppo/x.py", "from jaxnew.rollout import contract\nfrom .learner import Learner"),
         ("jaxnew/evaluation.py", "import jaxnew.ppo\nfrom jaxnew.storage import files, metrics"),
         ("jaxnew/run.py", "from jaxnew.embedding import TABLE_FILE\nimport jaxnew.trainer"),
-        ("jaxnew/sweeping.py", "from jaxnew import run, training\nfrom jaxnew.task import domain"),
+        ("jaxnew/sweeping.py", "from jaxnew import runs, training\nfrom jaxnew.task import domain"),
         ("experiments/x.py", "import brax, envs_host, envs_mjx.grid_world, jaxnew.loop, absl"),
         ("experiments/x.py", "from experiments import figures\nimport experiments.reports.plots"),
         ("experiments/x.py", "from experiments.flags import Arguments\nimport jaxnew.training"),
