@@ -14,12 +14,7 @@ def _rich_bar() -> Any | None:
     """A rich progress bar if rich is installed and the output is a terminal, else None."""
     try:
         from rich.console import Console
-        from rich.progress import (
-            BarColumn,
-            Progress,
-            TextColumn,
-            TimeRemainingColumn,
-        )
+        from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
     except ImportError:
         return None
     console = Console()

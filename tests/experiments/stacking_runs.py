@@ -12,7 +12,7 @@ import numpy as np
 from envs_mjx.shape_stacking import published_split
 from jaxnew.actions import ActionSplit
 from jaxnew.storage import metrics
-from tests.experiments.commands import OPTIMIZED, read_json
+from tests.experiments.commands import read_json
 from tests.experiments.several import run_several
 from tests.experiments.stacking_probes import EPISODES
 

@@ -31,7 +31,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import OPTIMIZED, ROOT, of_new_actions, read_json, run
+from tests.experiments.commands import ROOT, of_new_actions, read_json, run
 from tests.experiments.create_probes import acted
 from tests.experiments.create_runs import parameters
 from tests.experiments.several import run_several

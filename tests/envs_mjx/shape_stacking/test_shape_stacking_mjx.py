@@ -7,6 +7,7 @@ three shapes beside two cylinders.
 from __future__ import annotations
 
 import importlib.metadata
+import re
 from typing import Any
 
 import jax
@@ -17,7 +18,7 @@ import pytest
 from mujoco import mjx as mujoco_mjx
 from scipy import stats
 
-from envs_mjx.shape_stacking import rules, scene
+from envs_mjx.shape_stacking import films, rules, scene
 from envs_mjx.shape_stacking.engines import (
     Settled,
     _mjx_private,
@@ -241,6 +242,13 @@ def test_what_no_world_can_be_is_given_back(small: Mjx, where: str, value: float
     assert_near([found.qpos[2:]], [expected.qpos[2:]], 1e-5)
     # All these worlds went through one program.
     assert small._jitted._cache_size() == 1
+
+
+@pytest.mark.unit
+def test_an_engine_that_is_cut_short_for_a_film_runs_fewer_steps(small: Mjx) -> None:
+    program = str(jax.make_jaxpr(films._cut_short(small, 7).settle)(*falling(1)))
+    lengths = {int(steps) for steps in re.findall(r"length=(\d+)", program)}
+    assert {7, small.settle_steps} & lengths == {7}
 
 
 @pytest.mark.contract
