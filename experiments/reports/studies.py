@@ -14,7 +14,7 @@ from experiments.reports.asking import Asked, answers_of
 from experiments.reports.paper import PaperValue, paper_method, paper_results
 from experiments.reports.runs import Group, RunRecord, group_runs, policies
 from experiments.reports.study_report import Study, StudyPoint
-from jaxnew.actions import ActionSplit
+from jaxnew.actions import ActionIdentity, ActionSplit
 from jaxnew.embedding import Encoder
 from jaxnew.recording import collect
 from jaxnew.representation.table import RepresentationTable
@@ -139,8 +139,7 @@ def _recordings(encoder: Path | None, record: RunRecord, value: float) -> Asked:
         raise UsageError("--study=recordings needs --encoder=RUN, a run of embed.")
 
     def table(run: Run) -> dict[str, Any]:
-        vectors = encoded_test_actions(encoder, run.split, int(value))
-        return {"table": RepresentationTable(vectors, run.split.test)}
+        return {"table": encoded_test_actions(encoder, run.split, int(value))}
 
     return Asked(Question(f"recordings-{int(value)}", _usual(record)), table)
 
@@ -218,8 +217,10 @@ def study_runs(
     return Study(name, kind.axis, kind.has_log_axis, first.metric, tuple(points), *about)
 
 
-def encoded_test_actions(encoder: Path, split: ActionSplit, num_recordings: int) -> np.ndarray:
-    """f32[n, d] test actions as a frozen encoder sees them in their first recordings.
+def encoded_test_actions(
+    encoder: Path, split: ActionSplit, num_recordings: int
+) -> RepresentationTable:
+    """Test actions as a frozen encoder sees them in their first recordings.
 
     Raises:
       UsageError: the encoder has another split, or there are not so many recordings.
@@ -240,5 +241,11 @@ def encoded_test_actions(encoder: Path, split: ActionSplit, num_recordings: int)
             f"{num_recordings} recordings per action were asked for; {encoder.parent} has "
             f"{sizes[-1]}."
         )
-    recordings = collect(trained.domain(), encoder.parent.parent, sizes[-1], play)
-    return learner.encode(state, recordings.for_encoding(split.test, num_recordings))
+    domain = trained.domain()
+    recordings = collect(domain, encoder.parent.parent, sizes[-1], play)
+    return RepresentationTable(
+        vectors=learner.encode(state, recordings.for_encoding(split.test, num_recordings)),
+        ids=split.test,
+        encoder_hash=trained.table.made_by,
+        identity=ActionIdentity.of(domain.universe, split.test),
+    )

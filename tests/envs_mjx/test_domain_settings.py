@@ -41,7 +41,7 @@ def test_an_environment_is_made_from_the_fields(domain, settings, params) -> Non
     """With the same defaults, so that nothing set is the published task."""
     taken = {name: p.default for name, p in inspect.signature(domain).parameters.items()}
     assert dataclasses.asdict(settings()).items() <= taken.items()
-    assert set(taken) - set(dataclasses.asdict(settings())) <= {"position_dim", "shapes"}
+    assert set(taken) - set(dataclasses.asdict(settings())) <= {"position_dim", "shapes", "extra"}
     for field in dataclasses.fields(params):
         if field.default is not dataclasses.MISSING:
             assert field.default == getattr(settings(), field.name)

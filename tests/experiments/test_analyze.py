@@ -47,13 +47,10 @@ def rows_of(file: Path) -> list[dict[str, str]]:
 
 @pytest.mark.integration
 def test_sizes_ratios_growth_and_recordings(runs: Path) -> None:
-    common = (
-        f"--run={runs / POLICY}",
-        f"--encoder={runs / ENCODER}",
-        "--episodes=128",
-        f"--out={runs / 'analysis'}",
-    )
+    common = (f"--run={runs / POLICY}", "--episodes=128", f"--out={runs / 'analysis'}")
     jobs = [(f"--study={study}", f"--values={STUDIED[study]}", *common) for study in STUDIED]
+    assert jobs[-1][0] == "--study=recordings"
+    jobs[-1] = (*jobs[-1], f"--encoder={runs / ENCODER}")
     *first, again = run_several("analyze", [*jobs, jobs[-1]])
     assert " done in " not in again
     found = {}
@@ -100,10 +97,12 @@ def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> Non
     recordings = collection.load(runs / "recordings-16", universe=TASK.make_universe())
     rows = recordings.rows(split.test)
     expected = learner.encode(state, recordings.data[rows][:, :4])
-    np.testing.assert_array_equal(encoded_test_actions(runs / ENCODER, split, 4), expected)
+    found = encoded_test_actions(runs / ENCODER, split, 4)
+    np.testing.assert_array_equal(found.vectors, expected)
     table = RepresentationTable.load(runs / POLICY / "table.npz")
     everything = encoded_test_actions(runs / ENCODER, split, 16)
-    np.testing.assert_allclose(everything, table.rows(split.test), atol=1e-5)
+    assert everything.made_by == table.hash
+    np.testing.assert_allclose(everything.vectors, table.rows(split.test), atol=1e-5)
     with pytest.raises(UsageError, match=r"17 recordings per action were asked for.*has 16"):
         encoded_test_actions(runs / ENCODER, split, 17)
     other = replace(split, seed=1)

@@ -38,7 +38,7 @@ HEIGHT = "final_height"
 
 def measured(path: Path, count: int) -> dict[str, np.ndarray]:
     """The metrics of a run's first episodes on test sets."""
-    with Run.load(path, num_workers=1) as run:
+    with Run.load(path) as run:
         return measure(run.trainer.rollout, run.policy, run.trainer.actions("test"), count)
 
 
