@@ -10,10 +10,12 @@ import os
 import subprocess
 import sys
 import traceback
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from unittest import mock
+
+import jax
 
 ROOT = Path(__file__).resolve().parents[2]
 # Programs that are compiled fast rather than fast programs. Runs whose bits are compared have to be
@@ -68,6 +70,7 @@ def as_user(module: str, flags: Sequence[str]) -> tuple[str, bool]:
     text = io.StringIO()
     with (
         mock.patch.object(sys, "orig_argv", command_line(module, *flags)),
+        compiling(),
         contextlib.chdir(ROOT),
         contextlib.redirect_stdout(text),
         contextlib.redirect_stderr(text),
@@ -83,6 +86,18 @@ def as_user(module: str, flags: Sequence[str]) -> tuple[str, bool]:
             traceback.print_exc()
             return text.getvalue(), True
     return text.getvalue(), False
+
+
+@contextlib.contextmanager
+def compiling(optimized: bool = False) -> Iterator[None]:
+    """Programs are like those of `ENVIRONMENT`, or fast, whatever the marker of the test."""
+    name = "jax_disable_most_optimizations"
+    before = jax.config.read(name)
+    jax.config.update(name, not optimized)
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
 
 
 def refused(module: str, jobs: Iterable[Sequence[str | Path]]) -> list[str]:

@@ -1,7 +1,6 @@
 """What tests watch and do in the processes that run CREATE's commands; see `several`.
 
-Also what makes them fast enough for tests: jobs whose programs are equal share them. And as whole
-images are convolved at every decision, programs are worth optimizing (`OPTIMIZED`).
+Also what makes them fast enough for tests: jobs whose programs are equal share them.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
-"""Runs one command several times in one new process: `python -m tests.experiments.several`.
+"""Runs one command several times in one process, watched by a probe.
 
 Starting Python, importing JAX and compiling take most of a smoke run's time, and are paid once
-here. `run_several` starts it.
+here. `python -m tests.experiments.several` is the process where it is to be a new one.
 """
 
 from __future__ import annotations
@@ -14,11 +14,11 @@ import os
 import subprocess
 import sys
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from tests.experiments.commands import ENVIRONMENT, ROOT
+from tests.experiments.commands import ENVIRONMENT, ROOT, compiling
 
 _FAILED = "Traceback (most recent call last)"
 
@@ -29,19 +29,24 @@ def run_several(
     *,
     probe: str = "contextlib:nullcontext",
     may_fail: bool = False,
-    environment: Mapping[str, str] = ENVIRONMENT,
+    alone: bool = False,
+    optimized: bool = False,
 ) -> list[str]:
-    """What `python -m experiments.MODULE JOB` prints for each job, all of them in one new process.
+    """What `python -m experiments.MODULE JOB` prints for each job.
 
     Args:
       module: of `experiments`.
       jobs: the flags of each.
       probe: `package.module:NAME` of `job -> context manager`, in which the job is done.
       may_fail: a job's output may end with a traceback; later jobs are done all the same.
-      environment: variables of the process.
+      alone: in one new process, not in this one, which has imported JAX and compiled programs.
+      optimized: for jobs in this process that compute more than they compile.
     """
-    process = start_several(module, jobs, probe=probe, environment=environment)
-    outputs = finish_several(process)
+    if alone:
+        outputs = finish_several(start_several(module, jobs, probe=probe))
+    else:
+        with contextlib.chdir(ROOT), compiling(optimized):
+            outputs = main(module, probe, [[str(flag) for flag in job] for job in jobs])
     failed = [output for output in outputs if _FAILED in output]
     assert may_fail or not failed, "\n".join(failed)
     return outputs
@@ -52,13 +57,12 @@ def start_several(
     jobs: Sequence[Sequence[str | Path]],
     *,
     probe: str,
-    environment: Mapping[str, str] = ENVIRONMENT,
 ) -> subprocess.Popen[str]:
-    """The process of `run_several`, which `finish_several` waits for."""
+    """A new process that does what `run_several` does; `finish_several` waits for it."""
     process = subprocess.Popen(
         [sys.executable, "-m", "tests.experiments.several", module, probe],
         cwd=ROOT,
-        env={**os.environ, **environment},
+        env={**os.environ, **ENVIRONMENT},
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

@@ -54,13 +54,11 @@ class Run:
         )
 
 
-# One program for all of them; then each method and ablation with a program of its own.
-ALIKE = {
-    "line": Run(representation=EMBED.format("hvae"), flags=()),
+ALIKE = {"line": Run(representation=EMBED.format("hvae"), flags=())}
+# The first two have the program of `line`, the others each their own.
+OTHERS = {
     "no-entropy": Run(method="no-entropy"),
     "full": Run(split="full"),
-}
-OTHERS = {
     "no-place": Run("-no-place", "nearest-neighbour", "random-21"),
     "2d-place": Run(
         "-2d-place",
@@ -96,7 +94,7 @@ def embed(runs: Path, names: Iterable[str], *flags: str) -> list[str]:
 
 
 def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
-    """What `train` prints for each of `RUNS`, all in one process."""
+    """What `train` prints for each of `RUNS`."""
     names = list(names)
     jobs = [RUNS[name].training(runs, runs / name) for name in names]
     outputs = run_several("train", jobs, probe=WATCHED)
@@ -104,7 +102,7 @@ def train(runs: Path, names: Iterable[str]) -> dict[str, str]:
 
 
 def evaluate(runs: Path, names: Iterable[str], more: Mapping[str, Sequence[str]]) -> dict[str, str]:
-    """What `evaluate` prints in another process, and for more jobs.
+    """What `evaluate` prints, and for more jobs.
 
     For each of `RUNS` on train and test shapes.
     """

@@ -1,4 +1,4 @@
-"""CREATE through the commands at smoke budget: train, save, and evaluate in another process.
+"""CREATE through the commands at smoke budget: train, save, load and evaluate.
 
 Every level, and on top every method, representation and variant: `RUNS` gives each of them to a
 level. Then fine-tuning, and the studies of the analysis. What is made as elsewhere is `slow`.

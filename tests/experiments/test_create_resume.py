@@ -12,7 +12,7 @@ import pytest
 
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import OPTIMIZED, ROOT, command_line, read_json
+from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several
 
@@ -31,7 +31,7 @@ def stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     process = subprocess.Popen(
         command_line("train", *COMMON, f"--workdir={path}", "--workers=1"),
         cwd=ROOT,
-        env={**os.environ, **OPTIMIZED},
+        env={**os.environ, **ENVIRONMENT},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
@@ -60,7 +60,7 @@ def outputs(stopped: Path) -> dict[str, str]:
         "retried": (ONCE, "--workers=2", RESTART),
     }
     flags = [(*COMMON, f"--workdir={runs / name}", *more) for name, *more in jobs.values()]
-    printed = run_several("train", flags, probe=KILLING, may_fail=True)
+    printed = run_several("train", flags, probe=KILLING, may_fail=True, alone=True)
     return dict(zip(jobs, printed, strict=True))
 
 
@@ -71,7 +71,7 @@ def evaluated(stopped: Path, outputs: dict[str, str]) -> dict[str, str]:
     names = ("calm", "stopped", TWICE)
     common = ("--episodes=12", "--workers=2", RESTART)
     jobs = [(f"--run={stopped.parent / name}", *common) for name in names]
-    printed = run_several("evaluate", jobs, probe=KILLING)
+    printed = run_several("evaluate", jobs, probe=KILLING, alone=True)
     return dict(zip(names, printed, strict=True))
 
 

@@ -50,7 +50,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def evaluated(runs: Path) -> Path:
-    """The same, each run evaluated in another process."""
+    """The same, each run evaluated."""
     paths = [runs / name[0] / FOLDER.format(*name) for name in SIZES]
     run_several("evaluate", [(f"--run={path}", *EPISODES) for path in paths])
     return runs

@@ -1,4 +1,4 @@
-"""Shape Stacking through the commands at smoke budget: train, save, reload elsewhere, evaluate.
+"""Shape Stacking through the commands at smoke budget: train, save, reload, evaluate.
 
 Every method, ablation, representation, split and placement variant: `stacking_runs.RUNS` gives each
 of them to a run. Most are `slow`, for their programs take long to compile and are never kept.
@@ -48,6 +48,8 @@ HEIGHTS = (0.3, 10.0)
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The folder of all runs, with an encoder in it."""
     folder = tmp_path_factory.mktemp("runs")
+    pictures = ("--task=shape_stacking", "--recordings=1", "--frames=stored", f"--runs={folder}")
+    run_several("collect", [pictures], optimized=True)  # As drawing 810 takes long otherwise.
     stacking.embed(folder, ["hvae"], "--frames=stored")
     return folder
 
@@ -154,7 +156,7 @@ def test_a_run_is_trained_and_saved(runs: Path, trained: str, name: str) -> None
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_run_is_evaluated_in_another_process(runs: Path, evaluated: str, name: str) -> None:
+def test_a_run_is_loaded_and_evaluated(runs: Path, evaluated: str, name: str) -> None:
     path, split = runs / name, RUNS[name].action_split
     engine, found, mean = seen(evaluated), evaluation(path), means(path)
     assert engine.placed <= {*split.train.tolist(), *split.test.tolist()}
@@ -369,7 +371,7 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(
     (output,) = finish_several(process)
     assert "stopped at step 1; run again to go on" in output
     assert Checkpointer(path / "checkpoints").steps("latest")[-1] == 1
-    (output,) = run_several("train", [job], probe=WATCHED)
+    (output,) = run_several("train", [job], probe=WATCHED, alone=True)
     assert "at step 1 of 2" in output
     calm = runs / "line"
     for kind in ("best", "latest"):
@@ -390,7 +392,7 @@ def test_members_of_a_sweep_share_their_batches(
     flags = [flag for flag in run.training(runs, tmp_path / "sweep") if "seed" not in flag]
     job = (*flags, "--seeds=31,41", "--members_at_once=2")
     probe = f"{WATCHED}_on_one_core"
-    (output,) = run_several("sweep", [job], probe=probe)
+    (output,) = run_several("sweep", [job], probe=probe, alone=True)
     engine = seen(output)
     assert engine.batches == {(2, 2), (2, EPISODES)}
     split = published_split()

@@ -165,6 +165,7 @@ def test_17_random_play_in_all_slots(all_slots: OneProgram, c_engine: MujocoC) -
 
 
 @pytest.mark.golden
+@pytest.mark.slow
 def test_random_towers_are_those_of_c(engine: OneProgram, c_engine: MujocoC) -> None:
     """Three shapes each at random places: most towers are the same, and so are heights on average.
 
