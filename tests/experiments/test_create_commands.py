@@ -61,15 +61,15 @@ class Run:
     split: str = "default"
 
 
-# An engineered table, an encoder, a fixed set, and what is unlike choices by utility.
+# An engineered table, an encoder, a fixed set, and the other list of tools.
 FEW = {
     "push": Run("create-push", flags=()),
     "obstacle": Run("create-obstacle", representation=EMBED.format("hvae")),
-    "collide": Run("create-collide", "continuous"),
     "moving": Run("create-moving", "nearest-neighbour"),
     "analysis": Run("create-push-analysis"),
 }
 OTHERS = {
+    "collide": Run("create-collide", "continuous"),
     "seesaw": Run("create-seesaw", representation=EMBED.format("vae")),
     "navigate": Run("create-navigate", representation=EMBED.format("hvae-oracle")),
     "ladder": Run("create-ladder", representation=EMBED.format("hvae-position")),
