@@ -111,6 +111,7 @@ def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> Non
             encoded_test_actions(runs / ENCODER, other, 4)
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_a_grid_is_searched_by_validation(tmp_path: Path) -> None:
     common = ("--representation=gt12", "--budget=smoke", "--seeds=1,2", f"--runs={tmp_path}")

@@ -73,7 +73,7 @@ class Killed(Exception):
 
 
 @pytest.mark.integration
-@pytest.mark.parametrize("stores_drawn", [False, True])
+@pytest.mark.parametrize("stores_drawn", [False, pytest.param(True, marks=pytest.mark.slow)])
 def test_both_ways_and_a_resumed_run_give_the_same_bits(
     runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stores_drawn: bool
 ) -> None:
