@@ -386,10 +386,10 @@ def test_a_run_that_was_stopped_goes_on_to_the_same_bits(
 
 @pytest.mark.slow
 def test_members_of_a_sweep_share_their_batches(
-    runs: Path, trained_alike: dict[str, str], tmp_path: Path
+    runs: Path, trained_others: dict[str, str], tmp_path: Path
 ) -> None:
     """Two seeds side by side: the engine gets the worlds of both at once."""
-    assert trained_alike
+    assert trained_others
     run = RUNS["no-entropy"]
     flags = [flag for flag in run.training(runs, tmp_path / "sweep") if "seed" not in flag]
     job = (*flags, "--seeds=31,41", "--members_at_once=2")
