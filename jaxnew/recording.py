@@ -123,16 +123,8 @@ def collect(
     drawing = play.drawing
     if drawing is not None:
         print(_sizes(play.format, drawing.format, len(ids), num_recordings, stores_drawn))
-    recorded = collection.collect(
-        folder / f"{play.folder}-{num_recordings}",
-        play.record_block,
-        format=play.format,
-        universe=domain.universe,
-        ids=ids,
-        num_recordings=num_recordings,
-        seed=seed,
-        block_actions=play.block_actions,
-    )
+    path = folder / f"{play.folder}-{num_recordings}"
+    recorded = _recorded(path, domain, play, ids, num_recordings, seed)
     if drawing is None or not stores_drawn:
         return PlayRecordings(play, recorded)
     drawn = _draw_all(folder, drawing, domain.universe, recorded, seed)
@@ -188,22 +180,30 @@ def record(
     chosen = _chosen(domain, ids, own)
     play = parse_representation(domain, representation).play if representation else domain.play
     partial = output.with_name(f".{output.name}.unfinished")
-    recorded = collection.collect(
-        partial / play.folder,
-        play.record_block,
-        format=play.format,
-        universe=domain.universe,
-        ids=chosen,
-        num_recordings=num_recordings or domain.stage_one(play, budget).num_recordings,
-        seed=seed,
-        block_actions=play.block_actions,
-    )
+    count = num_recordings or domain.stage_one(play, budget).num_recordings
+    recorded = _recorded(partial / play.folder, domain, play, chosen, count, seed)
     if play.drawing is not None:
         recorded = _draw_all(partial, play.drawing, domain.universe, recorded, seed)
     identity = ActionIdentity.of(domain.universe, chosen, domain.task.universe_name)
     replace(recorded, identity=identity).save(output)
     shutil.rmtree(partial)
     return Recordings.load(output)
+
+
+def _recorded(
+    path: Path, domain: Domain, play: Play, ids: np.ndarray, num_recordings: int, seed: int
+) -> Recordings:
+    """What the play environment gives of some actions, collected in a directory."""
+    return collection.collect(
+        path,
+        play.record_block,
+        format=play.format,
+        universe=domain.universe,
+        ids=ids,
+        num_recordings=num_recordings,
+        seed=seed,
+        block_actions=play.block_actions,
+    )
 
 
 def _chosen(domain: Domain, ids: str | Path | np.ndarray, own: Task) -> np.ndarray:

@@ -2,20 +2,26 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from envs_mjx.grid_world import skill_universe
+from envs_mjx.grid_world import GridWorld, play, skill_universe
+from envs_mjx.grid_world.environment import encode_layout
 from envs_mjx.grid_world.skills import (
+    NUM_SKILLS,
     QUADRANT_NAMES,
+    load_skills,
     move_displacements,
     moves_of,
     net_displacement,
     quadrant_of,
     skill_name,
 )
+from jaxnew.environment import Action
 
 pytestmark = pytest.mark.unit
 
@@ -99,3 +105,26 @@ def test_skill_name_refuses_other_ids() -> None:
     for bad in (-1, 1024):
         with pytest.raises(ValueError, match=r"ids are 0\.\.1023"):
             skill_name(bad)
+
+
+@pytest.mark.oracle
+def test_skills_of_a_users_own_are_played_and_recorded_letter_by_letter(tmp_path: Path) -> None:
+    (tmp_path / "skills.txt").write_text("R.D..\n.RR.D\n")
+    extra = load_skills(tmp_path / "skills.txt")
+    assert extra == ("R.D..", ".RR.D")
+    steps = {"R": (1, 0), "D": (0, 1), ".": (0, 0)}
+    ways = np.cumsum([[steps[letter] for letter in name] for name in extra], axis=1)
+    env = GridWorld(extra=extra, fixed_layout=encode_layout(True, 5, 7))
+    _, start = env.reset_env(jax.random.key(0), env.default_params)
+    for row, way in enumerate(ways):
+        action = Action.of(NUM_SKILLS + row)
+        _, state, *_, info = env.step_env(jax.random.key(1), start, action, env.default_params)
+        assert state.agent_xy.tolist() == (way[-1] + 1).tolist()
+        assert (int(state.num_moves), bool(info["invalid_action"])) == (5, False)
+    beyond = Action.of(NUM_SKILLS + 2)
+    _, state, *_, info = env.step_env(jax.random.key(1), start, beyond, env.default_params)
+    assert bool(info["invalid_action"])
+    assert state.agent_xy.tolist() == [1, 1]
+    ids = np.array([NUM_SKILLS, NUM_SKILLS + 1])
+    seen = np.asarray(play.record(jax.random.key(2), ids, 3, False, extra)).astype(int)
+    np.testing.assert_array_equal(seen[:, :, 1:] - seen[:, :, :1], np.repeat(ways[:, None], 3, 1))
