@@ -40,6 +40,8 @@ class PPOConfig:
         if not self.max_grad_norm > 0:
             raise ValueError(f"max_grad_norm={self.max_grad_norm} must be positive.")
         num_transitions = self.steps_per_update
+        if num_transitions < 2:
+            raise ValueError("num_envs * num_steps = 1: one advantage has no deviation; take more.")
         if num_transitions % self.num_minibatches:
             raise ValueError(
                 f"num_envs * num_steps = {num_transitions} is not divisible by num_minibatches="

@@ -33,23 +33,38 @@ class RunningStatistics:
     def update(self, batch: jax.Array) -> RunningStatistics:
         """Statistics after one more batch f32[N, ...].
 
-        The merge of two samples in the form of increments, which keeps float32 accurate over
-        hundreds of millions of values: with `w` the share of the batch in the whole,
-        `variance += w * (batch_variance - variance) + w * (1 - w) * difference^2`.
+        The merge of two samples (Chan, Golub and LeVeque) in the form of increments: what weighs
+        more is moved towards what weighs less by the latter's share of the whole. So float32 stays
+        accurate over hundreds of millions of values, of which a batch is next to nothing, and for
+        batches of any width, beside which the initial count is next to nothing.
         """
-        count = self.count + batch.shape[0]
-        weight = batch.shape[0] / count
-        difference = jnp.mean(batch, axis=0) - self.mean
-        variance = self.variance + weight * (
-            jnp.var(batch, axis=0) - self.variance + (1.0 - weight) * difference**2
-        )
-        return RunningStatistics(self.mean + weight * difference, variance, count)
+        size = batch.shape[0]
+        count = self.count + size
+        share, rest = size / count, self.count / count  # Of the batch, and 1 less it, uncancelled.
+        batch_mean, batch_variance = jnp.mean(batch, axis=0), jnp.var(batch, axis=0)
+
+        def moved(old: jax.Array, new: jax.Array) -> jax.Array:
+            step = new - old
+            return jnp.where(share > 0.5, new - rest * step, old + share * step)
+
+        difference = batch_mean - self.mean
+        variance = moved(self.variance, batch_variance) + share * rest * difference**2
+        return RunningStatistics(moved(self.mean, batch_mean), variance, count)
+
+    @property
+    def _scale(self) -> jax.Array:
+        """One over the deviation, whose variance has 1e-8 added to it.
+
+        The bound changes no value. Compilers add up constants, of which the initial variance is
+        one, so that the sum alone may lose the small one, and a constant feature would be 0 times
+        infinity.
+        """
+        return jax.lax.rsqrt(jnp.maximum(self.variance + _EPSILON, _EPSILON))
 
     def normalize(self, values: jax.Array) -> jax.Array:
         """`(values - mean) / std`, clipped to +-10."""
-        scaled = (values - self.mean) * jax.lax.rsqrt(self.variance + _EPSILON)
-        return jnp.clip(scaled, -_CLIP, _CLIP)
+        return jnp.clip((values - self.mean) * self._scale, -_CLIP, _CLIP)
 
     def scale(self, values: jax.Array) -> jax.Array:
         """`values / std`, clipped to +-10; the mean is not subtracted."""
-        return jnp.clip(values * jax.lax.rsqrt(self.variance + _EPSILON), -_CLIP, _CLIP)
+        return jnp.clip(values * self._scale, -_CLIP, _CLIP)

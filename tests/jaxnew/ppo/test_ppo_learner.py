@@ -460,6 +460,7 @@ def test_metrics_of_several_updates_are_reduced() -> None:
     [
         ({"num_minibatches": 3}, r"32 is not divisible by num_minibatches=3"),
         ({"microbatch_size": 5}, r"16 transitions is not divisible by microbatch_size=5.*0"),
+        ({"rollout": RolloutConfig(1, 1)}, "one advantage has no deviation"),
         ({"lr_steps": 31}, r"lr_steps=31 is less than one update of 32 steps"),
         ({"time_limits_are_ends": False}, r"opposite of time_limits_are_ends, got False"),
         ({"num_minibatches": 0}, "num_minibatches"),

@@ -109,6 +109,54 @@ def test_long_stream_stays_accurate() -> None:
     np.testing.assert_allclose(statistics.variance, variance, rtol=1e-3)
 
 
+def features(num_values: int) -> np.ndarray:
+    """f32[N, 7]: constants, as Grid World's walls are, a rare flag, and numbers far from zero."""
+    rng = np.random.default_rng(num_values)
+    constants = np.tile([0.0, 0.1, 2.0, -3.0], (num_values, 1))
+    flag = rng.random(num_values) < 1e-3
+    offset, usual = rng.normal(100.0, 0.1, num_values), rng.normal(0.0, 1.0, num_values)
+    return np.column_stack([constants, flag, offset, usual]).astype(np.float32)
+
+
+def first_batch(batch: jax.Array) -> tuple[RunningStatistics, jax.Array]:
+    """As a rollout begins: all in one program, whose constants the compiler adds up."""
+    statistics = RunningStatistics.zeros(batch.shape[1:]).update(batch)
+    return statistics, statistics.normalize(batch)
+
+
+@pytest.mark.oracle
+@pytest.mark.parametrize("exponent", [5, 10, 11, 16])
+def test_batches_of_any_width(exponent: int) -> None:
+    """From 2,048 on, 1e-4 is lost in a float32 sum: constants had the variance 0, and were NaN."""
+    values = features(2**exponent)
+    members = np.stack([values, 2.0 * values])
+    for found, batch in zip(
+        (*jax.jit(jax.vmap(first_batch))(members), *jax.jit(first_batch)(values)),
+        (members, members, values, values),
+        strict=True,
+    ):
+        mean, variance = np.moveaxis(
+            np.array([expected_moments(one) for one in batch.reshape(-1, *values.shape)]), 1, 0
+        ).reshape(2, *batch.shape[:-2], 1, -1)
+        if isinstance(found, RunningStatistics):
+            np.testing.assert_allclose(found.variance, variance[..., 0, :], rtol=1e-5)
+        else:
+            # A sum's rounding, some 1e-8 of a number, over the floor of the deviation, 1e-4.
+            expected = np.clip((batch - mean) / np.sqrt(variance + 1e-8), -10, 10)
+            np.testing.assert_allclose(found, expected, atol=1e-3)
+
+
+@pytest.mark.unit
+def test_the_floor_of_the_deviation_is_no_constant_to_add_up() -> None:
+    """(1 + x) + 1e-8 is compiled to x + 1, which is 0 for x = -1."""
+
+    @jax.jit
+    def scaled(x: jax.Array) -> jax.Array:
+        return RunningStatistics(jnp.float32(0.0), 1.0 + x, jnp.float32(1.0)).scale(1e-4)
+
+    np.testing.assert_allclose(scaled(jnp.float32(-1.0)), 1.0, rtol=1e-5)
+
+
 @pytest.mark.property
 @pytest.mark.parametrize("constant", [0.0, 1.0, 2.0, -3.0])
 def test_constant_features_become_zero(constant: float) -> None:
