@@ -29,7 +29,7 @@ _PARTS = ("train", "validation", "test")
 _REPRESENTATION = "hvae-relative"
 
 
-def main() -> None:
+def main() -> int | None:
     start = time.perf_counter()
     task, budget = load_task("grid_world"), ARGUMENTS.budget
     encoder = embed(task, _REPRESENTATION, budget=budget, runs=ARGUMENTS.runs)
@@ -41,13 +41,14 @@ def main() -> None:
         overwrite=ARGUMENTS.overwrite,
     )
     if run.was_interrupted:
-        return
+        return run.interrupted_by
     print_report(encoder)
     print_success(run, task.budget(budget).final_episodes)
     for file in figures.make_figures([run.path], run.path / "figures"):
         print(f"  {file}")
     animate_run(run.path, run.path / "figures" / "zero_shot_episode.gif")
     print(f"{(time.perf_counter() - start) / 60:.1f} minutes. Everything is in {run.path}.")
+    return None
 
 
 def print_success(run: Run, num_episodes: int) -> None:

@@ -27,7 +27,7 @@ ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to 
 ARGUMENTS.define("string", "output", None, "Where to write the table of the new actions (.npz).")
 
 
-def main() -> None:
+def main() -> int | None:
     given = [ARGUMENTS.checkpoint, ARGUMENTS.observations, ARGUMENTS.output]
     if all(given):
         ARGUMENTS.refuse(_OF_TRAINING, "with --checkpoint")
@@ -53,6 +53,8 @@ def main() -> None:
         )
         if encoder.is_finished:
             print_report(encoder)
+        return encoder.interrupted_by
+    return None
 
 
 def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None:

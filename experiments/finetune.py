@@ -19,10 +19,10 @@ ARGUMENTS.define("string", "run", None, "Run directory of train.")
 ARGUMENTS.define("bool", "scratch", False, "Start from fresh parameters.")
 
 
-def main() -> None:
+def main() -> int | None:
     if ARGUMENTS.run is None:
         raise UsageError("Say which run to fine-tune: --run=DIRECTORY.")
-    finetune(
+    run = finetune(
         ARGUMENTS.run,
         is_scratch=ARGUMENTS.scratch,
         budget=ARGUMENTS.budget,
@@ -32,6 +32,7 @@ def main() -> None:
         overwrite=ARGUMENTS.overwrite,
         num_workers=ARGUMENTS.workers,
     )
+    return run.interrupted_by
 
 
 if __name__ == "__main__":

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 import textwrap
 from collections.abc import Callable, Sequence
@@ -12,6 +13,7 @@ from typing import Any
 from absl import flags, logging
 
 from envs_host.pool import WorkerError
+from jaxnew.loop import InterruptedRunError
 from jaxnew.task.places import UsageError
 
 # Flags of several commands: kind, default, help.
@@ -161,8 +163,12 @@ class Arguments:
             lines += ["", "Flags of absl:", _of_absl().get_help("  ")]
         return "\n".join(lines)
 
-    def start(self, main: Callable[[], None], arguments: list[str] | None = None) -> None:
-        """Runs a command's `main`; a user's mistake ends it with one line, not a traceback."""
+    def start(self, main: Callable[[], int | None], arguments: list[str] | None = None) -> None:
+        """Runs a command's `main`; a user's mistake ends it with one line, not a traceback.
+
+        A signal ends it with the status 128 + its number, at once or, where `main` returns the
+        number, after what was begun has been saved.
+        """
         arguments = sys.argv[1:] if arguments is None else arguments
         for word, is_full in (("--helpfull", True), ("--help", False)):
             if word in arguments:
@@ -175,11 +181,21 @@ class Arguments:
         logging.set_verbosity(logging.WARNING)  # Orbax logs every file it writes.
         configure_jax(self.debug_nans)
         try:
-            main()
+            stopped_by = main()
+        except InterruptedRunError as err:
+            print(err)
+            stopped_by = err.number
+        except KeyboardInterrupt:
+            if os.environ.get("JAXNEW_TRACEBACK"):
+                raise
+            print("Stopped by Ctrl-C.")
+            stopped_by = signal.SIGINT
         except (ValueError, ArithmeticError, WorkerError) as err:
             if self.debug_nans or os.environ.get("JAXNEW_TRACEBACK"):
                 raise
             sys.exit(f"{type(err).__name__}: {err}\n{_advice(err)}")
+        if stopped_by is not None:
+            sys.exit(128 + stopped_by)
 
 
 def _of_absl() -> flags.FlagValues:

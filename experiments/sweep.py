@@ -47,7 +47,7 @@ ARGUMENTS.define(
 Number = TypeVar("Number", int, float)
 
 
-def main() -> None:
+def main() -> int | None:
     # Each core is a device; without effect on accelerators.
     jax.config.update("jax_num_cpu_devices", available_cores())
     found = sweep(
@@ -69,6 +69,7 @@ def main() -> None:
     if found.rows:
         for file in show_sweep(found):
             print(file)
+    return found.interrupted_by
 
 
 def varied(entry: str) -> tuple[str, list[float]]:

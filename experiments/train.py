@@ -26,8 +26,8 @@ ARGUMENTS = Arguments(
 )
 
 
-def main() -> None:
-    train(
+def main() -> int | None:
+    run = train(
         ARGUMENTS.task,
         ARGUMENTS.representation,
         method=ARGUMENTS.method,
@@ -42,6 +42,7 @@ def main() -> None:
         overwrite=ARGUMENTS.overwrite,
         num_workers=ARGUMENTS.workers,
     )
+    return run.interrupted_by
 
 
 if __name__ == "__main__":

@@ -49,11 +49,13 @@ class Encoder:
       path: its run directory.
       config: all that fixes it.
       task: whose actions it was trained on.
+      interrupted_by: number of the signal that stopped its training just now, or None.
     """
 
     path: Path
     config: EmbedConfig
     task: Task
+    interrupted_by: int | None = None
     _table: RepresentationTable | None = None
 
     @classmethod
@@ -77,7 +79,7 @@ class Encoder:
         made = [s["table_hash"] for s in directory.provenance["sessions"] if "table_hash" in s]
         if table is not None and made:
             check_same("table", table.hash, made[-1], path)
-        return cls(directory.path, config, task or load_task(config.task), table)
+        return cls(directory.path, config, task or load_task(config.task), _table=table)
 
     @property
     def is_finished(self) -> bool:
@@ -89,10 +91,14 @@ class Encoder:
         """Representations of all actions of its domain.
 
         Raises:
-          UsageError: training was interrupted.
+          InterruptedRunError: a signal stopped training just now.
+          UsageError: training was interrupted earlier.
         """
         if self._table is None:
-            raise UsageError(f"{self.path} was interrupted; embed again to go on.")
+            message = f"{self.path} was interrupted; embed again to go on."
+            if self.interrupted_by is not None:
+                raise loop.InterruptedRunError(message, self.interrupted_by)
+            raise UsageError(message)
         return self._table
 
     def domain(self) -> Domain:
@@ -219,8 +225,8 @@ def embed(
         path, identity(config), overwrite, provenance, upgrade=upgraded
     ) as directory:
         source = f"{representation}, {budget}, seed {config.seed}"
-        _train(directory, domain, config, learned.modality, preset, recordings, source)
-    return Encoder.load(path, task)
+        stopped_by = _train(directory, domain, config, learned.modality, preset, recordings, source)
+    return replace(Encoder.load(path, task), interrupted_by=stopped_by)
 
 
 def _batch_size(model: RepresentationConfig) -> int:
@@ -263,8 +269,12 @@ def _train(
     preset: StageOneBudget,
     recordings: PlayRecordings,
     source: str,
-) -> None:
-    """Trains from where the directory stands to the end, and then writes the table."""
+) -> int | None:
+    """Trains from where the directory stands to the end, and then writes the table.
+
+    Returns:
+      The number of the signal that stopped it before there was a table, or None.
+    """
     model, name = config.model, config.representation
     learner = RepresentationLearner(model, modality)
     data = recordings.for_training(_with_always_available(domain.split, config.train_on))
@@ -285,7 +295,7 @@ def _train(
         ),
     )
     if result.was_interrupted or is_made:
-        return
+        return result.interrupted_by
     domain.split.save(directory.path / SPLIT_FILE)
     table = RepresentationTable(
         vectors=learner.encode(result.state, recordings.for_encoding()),
@@ -300,6 +310,7 @@ def _train(
     )
     table.save(directory.path / TABLE_FILE)
     directory.add_provenance(table_hash=table.hash)
+    return None
 
 
 def _train_chunk(
@@ -335,7 +346,8 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
       budget: of an encoder that has to be trained.
 
     Raises:
-      UsageError: there is no such representation, or its training was interrupted.
+      UsageError: there is no such representation, or its training was interrupted earlier.
+      InterruptedRunError: a signal stopped its training just now.
       SplitMismatch: the table belongs to another universe or split.
     """
     path = Path(representation)

@@ -12,6 +12,7 @@ import contextlib
 import dataclasses
 import fnmatch
 import math
+import os
 import signal
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -40,7 +41,7 @@ class LoopResult(Generic[State]):
       step: its step.
       best_metric, best_step: the highest value of the selection metric and the first step that
         reached it; None if nothing was evaluated. The `best` checkpoint holds that state.
-      was_interrupted: a signal stopped the run before `total_steps`; run again to go on.
+      interrupted_by: number of the signal that arrived while the run went on; None if none did.
       was_resumed: the run started from a checkpoint.
       last_evaluation: what the last evaluation of this process returned, or None.
     """
@@ -49,9 +50,14 @@ class LoopResult(Generic[State]):
     step: int
     best_metric: float | None
     best_step: int | None
-    was_interrupted: bool
+    interrupted_by: int | None
     was_resumed: bool
     last_evaluation: dict[str, float] | None
+
+    @property
+    def was_interrupted(self) -> bool:
+        """A signal asked the run, and what would follow it, to end; run again to go on."""
+        return self.interrupted_by is not None
 
 
 @dataclass(frozen=True)
@@ -163,16 +169,12 @@ def run(
         is_done = session.step == total_steps
         where = f"{run_directory.path} at step {session.step} of {total_steps}"
         progress.say(f"{title}: {'already complete' if is_done else 'resuming'}, {where}.")
-    was_interrupted = False
-    with progress, session.log, _interruption() as is_interrupted:
+    with progress, session.log, _interruption() as received:
         session.start_clock()
         if session.step < total_steps:
             first = min(rhythm.chunk_steps, total_steps - session.step)
             progress.update(session.step, f"compiling, and the first {first}")
-        while session.step < total_steps:
-            if is_interrupted():
-                was_interrupted = True
-                break
+        while session.step < total_steps and not received:
             before = session.step
             metrics = session.advance(chunk, min(rhythm.chunk_steps, total_steps - before))
             rate = session.report(metrics, before, display)
@@ -188,14 +190,14 @@ def run(
             if is_due:
                 session.save_latest()
         session.save_latest()
-        if was_interrupted:
+        if received:
             progress.say(f"{title}: stopped at step {session.step}; run again to go on.")
     return LoopResult(
         state=session.state,
         step=session.step,
         best_metric=session.best_metric,
         best_step=session.best_step,
-        was_interrupted=was_interrupted,
+        interrupted_by=received[0] if received else None,
         was_resumed=session.was_resumed,
         last_evaluation=session.last_evaluation,
     )
@@ -212,8 +214,8 @@ def _note(rate: str, metrics: Mapping[str, float], shown: Sequence[str]) -> str:
 
 
 @contextlib.contextmanager
-def _interruption() -> Iterator[Callable[[], bool]]:
-    """Yields a function that says whether SIGINT or SIGTERM arrived; the second one acts as ever.
+def _interruption() -> Iterator[list[int]]:
+    """Yields what lists SIGINT and SIGTERM once they arrive; the second one acts as ever.
 
     Outside the main thread signals keep their meaning.
     """
@@ -222,7 +224,9 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: Any) -> None:
         received.append(number)
-        print("Finishing the chunk, then saving; once more to stop at once.", flush=True)
+        # Not by `print`, which may be what the signal interrupts.
+        with contextlib.suppress(OSError):
+            os.write(1, b"Finishing the chunk, then saving; once more to stop at once.\n")
         for which, handler in previous.items():
             signal.signal(which, handler or signal.SIG_DFL)
 
@@ -232,10 +236,22 @@ def _interruption() -> Iterator[Callable[[], bool]]:
     except ValueError:  # Not the main thread.
         previous = {}
     try:
-        yield lambda: bool(received)
+        yield received
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler or signal.SIG_DFL)
+
+
+class InterruptedRunError(Exception):
+    """Work that others need was stopped by a signal; the same call again goes on.
+
+    Attributes:
+      number: of the signal.
+    """
+
+    def __init__(self, message: str, number: int) -> None:
+        super().__init__(message)
+        self.number = number
 
 
 class NonFiniteError(ArithmeticError):
@@ -269,7 +285,8 @@ class _Session(Generic[State]):
             self.best_metric, self.best_step = metadata["best_metric"], metadata["best_step"]
             self._elapsed_s = metadata["elapsed_s"]
         self.state = state
-        self.step = self._saved_step = _step_of(state)
+        self.step = _step_of(state)
+        self._saved_step = self.step if self.was_resumed else None
         # Whatever was recorded after the checkpoint is made again, identically.
         checkpointer.discard_after(self.step if self.was_resumed else -1)
         log.cut_back(self.step if self.was_resumed else -1)

@@ -117,7 +117,7 @@ class Run:
       policy: parameters and statistics of the checkpoint.
       step: updates that it was trained for.
       checkpoint: kind of the checkpoint, `best` (by validation) or `latest`.
-      was_interrupted: training was stopped before its end; train again to go on.
+      interrupted_by: number of the signal that stopped its training just now, or None.
     """
 
     path: Path
@@ -125,7 +125,7 @@ class Run:
     policy: Policy
     step: int
     checkpoint: str
-    was_interrupted: bool = False
+    interrupted_by: int | None = None
 
     @classmethod
     def load(
@@ -164,6 +164,11 @@ class Run:
         checkpointer = Checkpointer(path / "checkpoints")
         state, _ = checkpointer.restore(checkpoint, example, is_part=True)
         return cls(path, trainer, state.policy, int(state.step), checkpoint)
+
+    @property
+    def was_interrupted(self) -> bool:
+        """Training was stopped; train again to go on."""
+        return self.interrupted_by is not None
 
     @property
     def config(self) -> TrainConfig:

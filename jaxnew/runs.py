@@ -31,11 +31,13 @@ class Runs:
       rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
         hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
       task: what they were trained on.
+      interrupted_by: number of the signal that stopped the sweep just now, or None.
     """
 
     path: Path
     rows: tuple[Mapping[str, Any], ...]
     task: Task
+    interrupted_by: int | None = None
 
     @classmethod
     def load(cls, path: Path | str, task: Task | None = None) -> Self:

@@ -280,7 +280,7 @@ def sweep(
             may_be_nan=("*",),  # One diverged member does not end the others.
         )
         if result.was_interrupted:
-            return Runs(path, (), task)
+            return Runs(path, (), task, result.interrupted_by)
         write_members(directory, program, result.state)
     return Runs.load(directory.path, task)
 

@@ -72,6 +72,7 @@ def train(
       UsageError, ConfigError: something does not exist, or takes no such value.
       ConfigMismatch: the directory holds another run.
       SplitMismatch: the table was made for another split or universe.
+      InterruptedRunError: a signal stopped the training of the encoder that it needs.
     """
     task = load_task(task) if isinstance(task, str) else task
     domain, runs = Domain.of(task, split, split_seed), Path(runs)
@@ -95,7 +96,7 @@ def train(
             f"{trainer.selection_metric} {result.best_metric:.3f} at update {result.best_step}."
         )
     run = Run.of(path, trainer, "latest" if result.best_metric is None else "best")
-    return replace(run, was_interrupted=result.was_interrupted)
+    return replace(run, interrupted_by=result.interrupted_by)
 
 
 def finetune(
@@ -142,7 +143,7 @@ def finetune(
             print(f"{title}: {config.num_updates} updates with test actions in {path}.")
             result = run_updates(trainer, state, directory, title, is_evaluated=False)
     run = Run.of(path, trainer, "latest")
-    return replace(run, was_interrupted=result.was_interrupted)
+    return replace(run, interrupted_by=result.interrupted_by)
 
 
 def named_table(

@@ -46,13 +46,13 @@ class Benchmark(Arguments):
         self.define("string", "output", None, "File that JSON lines are appended to.")
         self.define("integer", "repeats", 5, "Timed calls of each subject.", lower_bound=5)
 
-    def start(self, main: Callable[[], None], arguments: list[str] | None = None) -> None:
+    def start(self, main: Callable[[], int | None], arguments: list[str] | None = None) -> None:
         """Runs `main`; see `Arguments.start`."""
 
-        def compiling() -> None:
+        def compiling() -> int | None:
             jax.config.update("jax_enable_compilation_cache", False)
             jax.config.update("jax_disable_most_optimizations", self.quick)
-            main()
+            return main()
 
         super().start(compiling, arguments)
 

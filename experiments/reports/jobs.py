@@ -21,6 +21,7 @@ from experiments.reports.production import Cell, Source
 from experiments.reports.runs import read_runs
 from jaxnew.cores import available_cores
 from jaxnew.embedding import TABLE_FILE, is_learned
+from jaxnew.loop import InterruptedRunError
 from jaxnew.recording import parse_representation
 from jaxnew.storage.run_directory import RunDirectoryError
 from jaxnew.task.methods import file_name
@@ -57,7 +58,8 @@ class Job:
         """Runs the command in a process of its own, and lets it save and end on a signal.
 
         Raises:
-          UsageError: the command failed, or was stopped.
+          UsageError: the command failed.
+          InterruptedRunError: it, or this process, was stopped by a signal.
         """
         print(f"{self.title} ({self.cost}): {self.text}", flush=True)
         line, environment = child(*self.command)
@@ -75,8 +77,10 @@ class Job:
         finally:
             for which, handler in previous.items():
                 signal.signal(which, handler)
-        if received:
-            raise UsageError("Stopped; call the same command again to go on.")
+        stops = {s for n in (signal.SIGINT, signal.SIGTERM) for s in (128 + n, -n)}
+        if received or status in stops:
+            number = received[0] if received else abs(status) % 128
+            raise InterruptedRunError("Stopped; call the same command again to go on.", number)
         if status:
             raise UsageError(f"The command ended with status {status}: {self.text}")
 

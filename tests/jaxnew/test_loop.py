@@ -289,12 +289,37 @@ def test_a_signal_finishes_the_chunk_saves_and_returns(
     handler = signal.getsignal(number)
     result = train(tmp_path, chunk=interrupted)
     assert result.was_interrupted
+    assert result.interrupted_by == number
     assert signal.getsignal(number) is handler
     # Not a multiple of checkpoint_every, nor a new best: saved because of the signal.
     assert result.step == 45
     assert Checkpointer(tmp_path / "checkpoints").steps("latest")[-1] == 45
     assert train(tmp_path).was_resumed
     assert outcome(tmp_path) == undisturbed
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("last", [0, 47])
+def test_a_signal_before_the_first_or_in_the_last_chunk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, last: int
+) -> None:
+    """What is there is saved, and who called hears of it: nothing is to follow."""
+    start_clock = loop._Session.start_clock
+
+    def interrupted(self: Any) -> None:
+        start_clock(self)
+        if last == 0 and signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL:
+            signal.raise_signal(signal.SIGTERM)
+
+    def in_the_last(state: Toy, n: int) -> Any:
+        if n == 2:
+            signal.raise_signal(signal.SIGTERM)
+        return chunk(state, n)
+
+    monkeypatch.setattr(loop._Session, "start_clock", interrupted)
+    result = train(tmp_path, chunk=in_the_last)
+    assert (result.step, result.interrupted_by) == (last, signal.SIGTERM)
+    assert Checkpointer(tmp_path / "checkpoints").steps("latest")[-1] == last
 
 
 @pytest.mark.unit

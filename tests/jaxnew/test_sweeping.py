@@ -246,7 +246,7 @@ def test_no_sweep_meets_another(
     """Whatever differs; and what it takes follows from the settings."""
 
     def stop(*given: Any, **named: Any) -> Any:
-        return SimpleNamespace(was_interrupted=True)
+        return SimpleNamespace(was_interrupted=True, interrupted_by=15)
 
     monkeypatch.setattr(loop, "run", stop)
     changes: list[dict[str, Any]] = [
@@ -259,9 +259,10 @@ def test_no_sweep_meets_another(
     arguments = {"seeds": [3, 4], "vary": VARY, "budget": "smoke", "runs": tmp_path}
     paths = [sweep(LADDER, "gt3", **{**arguments, **change}).path for change in changes]
     assert len(set(paths)) == len(changes)
-    assert sweep(LADDER, "gt3", **arguments).path == paths[0]
-    first, *_, other, _, again = capsys.readouterr().out.splitlines()
-    assert first == again
+    again = sweep(LADDER, "gt3", **arguments)
+    assert (again.path, again.interrupted_by) == (paths[0], 15)
+    first, *_, other, _, last = capsys.readouterr().out.splitlines()
+    assert first == last
     assert "of its steps" not in first
     assert f"this has {2 / LADDER.budget('smoke').num_updates:.2g} of its steps" in other
     with pytest.raises(UsageError, match="has written no members yet; run it to its end"):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
+from experiments.reports import jobs
 from experiments.reports.jobs import (
     Job,
     announce,
@@ -20,6 +22,7 @@ from experiments.reports.jobs import (
 )
 from experiments.reports.production import Cell, Source
 from experiments.tasks.grid_world import TASK
+from jaxnew.loop import InterruptedRunError
 from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
 from tests.experiments.handwritten import source_of
@@ -66,6 +69,25 @@ def test_a_command_that_fails_ends_the_plan(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(UsageError, match="ended with status 1: python -m"):
         Job("it", ("sweep", "--x"), "seconds", None, Path()).run()
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("code", "number"),
+    [
+        ("import sys; sys.exit(143)", signal.SIGTERM),
+        ("import os; os.kill(os.getpid(), 15)", signal.SIGTERM),
+        ("import sys; sys.exit(130)", signal.SIGINT),
+        # To the list; a command that is through all the same is the last one.
+        ("import os, signal, time; os.kill(os.getppid(), signal.SIGINT); time.sleep(0.2)", 2),
+        ("import os, time; os.kill(os.getppid(), 15); time.sleep(60)", signal.SIGTERM),
+    ],
+)
+def test_a_signal_ends_the_plan(monkeypatch: pytest.MonkeyPatch, code: str, number: int) -> None:
+    monkeypatch.setattr(jobs, "child", lambda *command: ([sys.executable, "-c", code], None))
+    with pytest.raises(InterruptedRunError, match="same command again to go on") as caught:
+        Job("it", ("sweep", "--x"), "seconds", None, Path()).run()
+    assert caught.value.number == number
 
 
 @pytest.mark.unit
