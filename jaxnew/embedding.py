@@ -279,13 +279,14 @@ def _train(
     learner = RepresentationLearner(model, modality)
     data = recordings.for_training(_with_always_available(domain.split, config.train_on))
     is_made = (directory.path / TABLE_FILE).exists()
+    chunk_steps = min(preset.chunk_steps, preset.checkpoint_every)
     if not is_made:
         print(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
     result = loop.run(
         learner.init(jax.random.key(config.seed), data.shape),
         lambda state, n: _train_chunk(learner, data, state, n),
         directory,
-        loop.Rhythm(model.num_steps, preset.chunk_steps, preset.checkpoint_every),
+        loop.Rhythm(model.num_steps, chunk_steps, preset.checkpoint_every),
         loop.Display(
             name,
             unit="steps",

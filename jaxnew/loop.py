@@ -30,6 +30,7 @@ from jaxnew.storage.run_directory import RunDirectory
 
 State = TypeVar("State")
 Scalars = Mapping[str, Any]
+CHECKPOINT_EVERY_S = 300.0  # Of wall clock, whatever the rhythm.
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,7 @@ class Rhythm:
     Attributes:
       total_steps: at the end.
       chunk_steps: per call.
-      checkpoint_every: between `latest` checkpoints.
+      checkpoint_every: between `latest` checkpoints, which are five minutes apart at most.
       evaluate_every: between evaluations; None: nothing is evaluated.
 
     Raises:
@@ -119,9 +120,11 @@ def run(
     """Runs `chunk` until the end, resuming from the run directory if it holds a checkpoint.
 
     Evaluations and checkpoints happen at the end of the first chunk that reaches or passes a
-    multiple of their interval, and at the end of the run. A new best evaluation is checkpointed at
-    once. SIGINT and SIGTERM let the chunk finish, save, and return; a second one stops at once,
-    which loses only what came after the last checkpoint.
+    multiple of their interval, and at the end of the run; a checkpoint also at the end of the first
+    chunk that ends five minutes after the last one, so that a kill loses five minutes and a chunk
+    at most. A new best evaluation is checkpointed at once. SIGINT and SIGTERM let the chunk finish,
+    save, and return; a second one stops at once, which loses only what came after the last
+    checkpoint.
 
     Args:
       state: freshly initialised pytree at step 0, replaced by the checkpoint when resuming. Its
@@ -169,6 +172,7 @@ def run(
         is_done = session.step == total_steps
         where = f"{run_directory.path} at step {session.step} of {total_steps}"
         progress.say(f"{title}: {'already complete' if is_done else 'resuming'}, {where}.")
+    is_slow = False  # Which is said once.
     with progress, session.log, _interruption() as received:
         session.start_clock()
         if session.step < total_steps:
@@ -178,11 +182,18 @@ def run(
             before = session.step
             metrics = session.advance(chunk, min(rhythm.chunk_steps, total_steps - before))
             rate = session.report(metrics, before, display)
+            if session.chunk_s > CHECKPOINT_EVERY_S and not is_slow:
+                is_slow = True
+                progress.say(
+                    f"{title}: a chunk of {session.step - before} {display.unit} takes "
+                    f"{duration(session.chunk_s)}, and a kill loses as much. Shorter ones lose "
+                    "less; those of a policy are set by --set=loop.chunk_updates=N."
+                )
             if session.is_first_chunk:
                 progress.restart_clock(session.step)
             progress.update(session.step, _note(rate, metrics, display.metrics))
             is_last = session.step >= total_steps
-            is_due = is_passed(rhythm.checkpoint_every, before, session.step)
+            is_due = is_passed(rhythm.checkpoint_every, before, session.step) or session.is_overdue
             if evaluate is not None and (
                 is_last or is_passed(rhythm.evaluate_every, before, session.step)
             ):
@@ -278,7 +289,8 @@ class _Session(Generic[State]):
         self.best_step: int | None = None
         self._elapsed_s = 0.0
         self.was_resumed = bool(checkpointer.steps("latest"))
-        self.is_first_chunk = False
+        self.is_first_chunk, self.chunk_s = False, 0.0
+        self._saved_at = time.monotonic()
         self._num_chunks = 0
         if self.was_resumed:
             state, metadata = checkpointer.restore("latest", state)
@@ -306,10 +318,11 @@ class _Session(Generic[State]):
         self, chunk: Callable[[State, int], tuple[State, Scalars]], n: int
     ) -> dict[str, float]:
         """Runs one chunk of n steps; returns its metrics as floats, checked to be finite."""
-        before = self.step
+        before, start = self.step, time.monotonic()
         state, metrics = chunk(self.state, n)
         self.state = state
         values = _floats(metrics)
+        self.chunk_s = time.monotonic() - start
         self.step = _step_of(state)
         self._num_chunks += 1
         self.is_first_chunk = self._num_chunks == 1
@@ -373,11 +386,16 @@ class _Session(Generic[State]):
         self._save("best")
         return True
 
+    @property
+    def is_overdue(self) -> bool:
+        """The last checkpoint is five minutes old."""
+        return time.monotonic() - self._saved_at >= CHECKPOINT_EVERY_S
+
     def save_latest(self) -> None:
         """Saves the state from which a later process goes on, unless that was done already."""
         if self._saved_step != self.step:
             self._save("latest")
-            self._saved_step = self.step
+            self._saved_step, self._saved_at = self.step, time.monotonic()
 
     def _save(self, kind: Kind) -> None:
         for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(self.state, "params", ())):

@@ -73,6 +73,7 @@ _STAGE_ONE = {
     "paper": replace(
         _stage_one(1024, 500, "10 days on one core, from the rate of `laptop`"),
         stores_drawn=False,
+        chunk_steps=10,
         counts_epochs=True,
     ),
 }

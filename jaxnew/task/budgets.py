@@ -21,10 +21,12 @@ class StageOneBudget:
     Attributes:
       num_recordings: recordings per action to collect.
       hvae, vae: hyper-parameters by kind.
-      checkpoint_every: gradient steps between checkpoints.
+      checkpoint_every: gradient steps between checkpoints, which are five minutes apart at most.
       cost: what it takes; shown before it starts.
       stores_drawn: recordings of a play with a drawing are drawn once and stored; else they are
         drawn for each batch. The numbers are the same.
+      chunk_steps: gradient steps per compiled call; a kill loses as many at least, so that they
+        should take less than five minutes.
       counts_epochs: the steps are those of the default split, and encoders that are trained on
         more or fewer actions take as many passes over them, not as many steps.
     """
@@ -35,6 +37,7 @@ class StageOneBudget:
     checkpoint_every: int
     cost: str
     stores_drawn: bool = False
+    chunk_steps: int = 20
     counts_epochs: bool = False
 
     def vary(self, **changes: Any) -> StageOneBudget:
@@ -44,11 +47,6 @@ class StageOneBudget:
           ConfigError: there is no such field, or it takes no such value.
         """
         return config_lib.vary(self, changes)
-
-    @property
-    def chunk_steps(self) -> int:
-        """Gradient steps per compiled call."""
-        return min(20, self.checkpoint_every)
 
     def config(self, kind: str, num_actions: int, num_default: int) -> RepresentationConfig:
         """The hyper-parameters of an encoder.
@@ -74,7 +72,7 @@ class LoopConfig:
       evaluate_every: updates between evaluations on train and validation sets.
       evaluation_episodes: episodes per evaluation and split.
       evaluation_set_size: actions in its sets; 0 for as many as in training.
-      checkpoint_every: updates between `latest` checkpoints.
+      checkpoint_every: updates between `latest` checkpoints, which are five minutes apart at most.
     """
 
     chunk_updates: int = 5

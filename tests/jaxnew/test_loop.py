@@ -16,6 +16,7 @@ import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -149,6 +150,45 @@ def test_chunks_that_step_over_an_interval_are_followed_by_what_was_due(tmp_path
     evaluated = [r["step"] for r in reports(tmp_path) if "validation/success" in r]
     # Chunks end at 3, 6, 9 and 10: 4 and 8 are passed, 10 is the end.
     assert evaluated == [6, 9, 10]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("chunk_s", "saved"),
+    [
+        (100.0, [15, 30, 45, 47]),
+        (350.0, [5, 10, 15, 20, 25, 30, 35, 40, 45, 47]),
+        (1.0, [47]),
+    ],
+)
+def test_checkpoints_are_five_minutes_apart_at_most(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    undisturbed: dict[str, Any],
+    chunk_s: float,
+    saved: list[int],
+) -> None:
+    """Whatever the rhythm; a longer chunk is said once; the state is the same."""
+    now = [0.0]
+    kept: list[int] = []
+    save = Checkpointer.save
+
+    def lasting(state: Toy, n: int) -> Any:
+        now[0] += chunk_s
+        return chunk(state, n)
+
+    def noted(self: Checkpointer, kind: Any, step: int, *rest: Any) -> Any:
+        kept.extend([step] * (kind == "latest"))
+        return save(self, kind, step, *rest)
+
+    monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: now[0]))
+    monkeypatch.setattr(Checkpointer, "save", noted)
+    unseen = {"evaluate": None, "evaluate_every": None, "selection_metric": None}
+    result = train(tmp_path, chunk=lasting, checkpoint_every=1000, **unseen)
+    assert kept == saved
+    assert capsys.readouterr().out.count("a chunk of 5 updates takes 5:50") == (chunk_s > 300)
+    assert digest(result.state) == undisturbed["latest"][1]
 
 
 @pytest.mark.unit

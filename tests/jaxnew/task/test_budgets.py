@@ -56,11 +56,6 @@ def test_what_is_foretold_follows_the_settings() -> None:
     assert told == "1 hour for the preset; this has 0.25 of its steps and 2 of its recordings"
 
 
-def test_chunks_are_not_longer_than_what_a_checkpoint_saves() -> None:
-    assert ONE.chunk_steps == 2
-    assert replace(ONE, checkpoint_every=400).chunk_steps == 20
-
-
 @pytest.mark.parametrize("name", sorted(vars(LoopConfig())))
 def test_rhythms_are_counts(name: str) -> None:
     low = 0 if name == "evaluation_set_size" else 1
