@@ -85,12 +85,13 @@ class Mjx:
         self._data = _mjx_private.mjx.make_data(model, impl="jax")
         self._jitted = jax.jit(self._settle_flat)
 
-    def __copy__(self) -> Mjx:
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_jitted"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """A copy has a program of its own, so that its `settle_steps` may be changed."""
-        twin = object.__new__(type(self))
-        vars(twin).update(vars(self))
-        twin._jitted = jax.jit(twin._settle_flat)
-        return twin
+        vars(self).update(state)
+        self._jitted = jax.jit(self._settle_flat)
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         """Simulates `settle_steps` physics steps; arrays as in `engines.Engine.settle`.

@@ -6,7 +6,9 @@ three shapes beside two cylinders.
 
 from __future__ import annotations
 
+import copy
 import importlib.metadata
+import pickle
 import re
 from typing import Any
 
@@ -385,6 +387,18 @@ def test_bad_input_is_refused(small: Mjx) -> None:
     ):
         with pytest.raises(ValueError, match=message):
             Mjx(**options)
+
+
+@pytest.mark.unit
+def test_copies_have_programs_of_their_own(small: Mjx) -> None:
+    """So that the steps of each may be changed; all else that a program depends on is the same."""
+    for copied in (copy.copy(small), copy.deepcopy(small), pickle.loads(pickle.dumps(small))):
+        assert copied._jitted.__wrapped__.__self__ is copied
+        assert (copied.settle_steps, copied.shapes, copied._limits) == (30, OWN, small._limits)
+        same = jax.tree.map(
+            np.array_equal, (copied._model, copied._data), (small._model, small._data)
+        )
+        assert all(jax.tree.leaves(same))
 
 
 @pytest.mark.unit
