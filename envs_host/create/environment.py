@@ -23,7 +23,6 @@ from envs_host.create.tools import Tool, all_tools
 from envs_host.create.world import Placement, World
 
 if TYPE_CHECKING:
-    from envs_host.create.films import Trail
     from envs_host.create.illustration import RenderOptions
 
 _DRAWING = "envs_host.create.drawing"
@@ -100,7 +99,7 @@ class CreateEnv(gymnasium.Env):
         self._draw = None if self.config.observation == "none" else _load(_DRAWING).draw
         # Called after every 4 substeps, for films.
         self.watch: Callable[[World], None] | None = None
-        self._trail: Trail | None = None if render_mode is None else _load(_FILMS).Trail()
+        self._trail = None if render_mode is None else _load(_FILMS).Trail()
         self._render_options = render_options
         self._available = np.arange(len(self._tools), dtype=np.int32)
         self._episode: Episode | None = None

@@ -288,10 +288,14 @@ def test_bad_input_is_refused(short: MujocoC) -> None:
     ids[1, 3] = 810
     with pytest.raises(ValueError, match=r"shape_ids has 810; ids are 0\.\.809"):
         short.settle_host(ids, qpos, qvel)
-    with pytest.raises(ValueError, match="settle_steps=0 must be at least 1"):
+    with pytest.raises(ValueError, match="settle_steps=0 must be 1 to 100,000"):
         MujocoC(settle_steps=0)
     with pytest.raises(ValueError, match="num_threads=-1 must be 0"):
         MujocoC(num_threads=-1)
+    with pytest.raises(ValueError, match="num_threads=1000000 must be 0"):
+        MujocoC(num_threads=10**6)
+    with pytest.raises(ValueError, match="settle_steps=1000000000 must be 1 to"):
+        MujocoC(settle_steps=10**9)
 
 
 @pytest.mark.unit
