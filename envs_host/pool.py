@@ -283,6 +283,12 @@ class HostPool:
         """Ends the workers; arrays that were handed out stay valid."""
         self._workers.close("close() was called")
 
+    def __reduce__(self) -> Any:
+        raise TypeError(
+            "A HostPool has processes, which cannot be copied; make another one and give it "
+            "state_dict() by load_state()."
+        )
+
     def __enter__(self) -> HostPool:
         return self
 

@@ -26,6 +26,7 @@ from envs_host import channel as codes
 from envs_host.channel import Channel, HungUp
 from envs_host.memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
 from envs_host.protocol import HostEnvironment, load_factory
+from jaxnew.cores import signal_at_parents_end
 
 # A worker in the middle of a step gets this long to finish once the pool's process is gone.
 GRACE_S = 1.0
@@ -241,6 +242,9 @@ def main(socket_descriptor: int, report_descriptor: int) -> None:
       report_descriptor: of the file that gets a traceback when the process crashes, and on SIGUSR1.
     """
     parent = os.getppid()
+    # A stopped process could not end itself. No signal that ends it: it may be that only the thread
+    # of the pool's process is gone that started it.
+    signal_at_parents_end(signal.SIGCONT)
     # Ctrl-C reaches the whole process group; ending is the pool's decision. The pool blocked the
     # signal so that it could not arrive before this line.
     signal.signal(signal.SIGINT, signal.SIG_IGN)

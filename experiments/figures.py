@@ -86,7 +86,9 @@ ARGUMENTS.define(
 )
 ARGUMENTS.define("bool", "dry_run", False, "Only say what is missing and how long it takes.")
 ARGUMENTS.define("integer", "films", 20, "Episodes that figure 8 shows.", lower_bound=1)
-ARGUMENTS.define("integer", "film_size", 512, "Pixels of their side.", lower_bound=16)
+ARGUMENTS.define(
+    "integer", "film_size", 512, "Pixels of their side.", lower_bound=16, upper_bound=4096
+)
 ARGUMENTS.define(
     "enum", "film_format", "gif", "Of their files; mp4: jaxnew[video].", choices=["gif", "mp4"]
 )

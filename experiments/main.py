@@ -5,10 +5,12 @@ from __future__ import annotations
 import ast
 import importlib
 import os
+import signal
 import sys
 from pathlib import Path
 
 import experiments
+from jaxnew.cores import signal_at_parents_end
 
 COMMANDS = (
     "collect",
@@ -25,8 +27,17 @@ COMMANDS = (
 )
 
 
+# In the environment of a `child`: the process that started it.
+_PARENT = "JAXNEW_PARENT"
+
+
 def main() -> None:
     """Runs the command that the first argument names."""
+    parent = os.environ.pop(_PARENT, None)
+    if parent is not None:
+        signal_at_parents_end(signal.SIGTERM)  # It saves and ends: nobody waits for it any more.
+        if parent != str(os.getppid()):
+            sys.exit(f"Process {parent}, which started this one, is gone.")
     name, *arguments = sys.argv[1:] or ["--help"]
     if name in ("--help", "-h", "help"):
         print("jaxnew COMMAND [--flag=value ...]\n")
@@ -54,7 +65,7 @@ def child(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
     root = str(Path(experiments.__file__).parents[1])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     line = [sys.executable, "-P", "-m", "experiments.main", name, *arguments]
-    return line, {**os.environ, "PYTHONPATH": path}
+    return line, {**os.environ, "PYTHONPATH": path, _PARENT: str(os.getpid())}
 
 
 if __name__ == "__main__":

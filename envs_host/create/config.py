@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Any, Literal, get_args
 
+from envs_host.create.levels.object_types import REWARD
+from envs_host.create.levels.schema import MAX_STEPS
 from envs_host.create.tools import no_op_id, published_split
 from envs_host.create.tools.catalogue import ANALYSIS_SPACING_DEG, DEFAULT_SPACING_DEG
 from envs_host.create.tools.splits import analysis_split
@@ -21,6 +22,7 @@ Observation = Literal["gray", "rgb", "none"]
 
 # Of the environments. Raised by what may move a learning curve (CHANGELOG.md, "Errata").
 VERSION = 1
+MAX_PIXELS = 4096  # Of the side of a picture.
 
 
 @dataclass(frozen=True)
@@ -28,15 +30,15 @@ class PhysicsConfig:
     """Physics of the world (docs/create.md, "World").
 
     Attributes:
-      gravity: units/s^2 downwards.
-      substeps: `Space.step` calls of 1/30 s in one action.
+      gravity: units/s^2 downwards, 0 to 1000.
+      substeps: `Space.step` calls of 1/30 s in one action, 1 to 10,000.
       fan_frame: frame of a fan's force: "body" turns with the object (the release that made the
         paper's numbers), "world" does not (the later release).
       bucket_zeroes_velocity: whether a caught object's velocity is zeroed on every substep (the
         later release) or grows (the paper's).
 
     Raises:
-      ValueError: a value is not as above, `gravity` is negative or `substeps` below 1.
+      ValueError: a value is not as above.
     """
 
     gravity: float = 2.0
@@ -45,8 +47,8 @@ class PhysicsConfig:
     bucket_zeroes_velocity: bool = False
 
     def __post_init__(self) -> None:
-        _check_range(self, "gravity", 0)
-        _check_range(self, "substeps", 1)
+        _check_range(self, "gravity", 0, 1_000)
+        _check_range(self, "substeps", 1, MAX_STEPS)
         _check_choice(self, "fan_frame", FanFrame)
 
 
@@ -67,7 +69,7 @@ class RewardConfig:
         distance target-goal if the target is armed, and of target-marker in marker levels.
 
     Raises:
-      ValueError: a reward is not finite, or `per_tool_discount` or `dense_scale` is negative.
+      ValueError: a reward is beyond a million, or `per_tool_discount` or `dense_scale` is negative.
     """
 
     alive: float = 0.01
@@ -85,7 +87,7 @@ class RewardConfig:
     def __post_init__(self) -> None:
         for each in fields(self):
             is_size = each.name in ("per_tool_discount", "dense_scale")
-            _check_range(self, each.name, 0 if is_size else -math.inf)
+            _check_range(self, each.name, 0 if is_size else REWARD.low, REWARD.high)
 
 
 @dataclass(frozen=True)
@@ -123,14 +125,14 @@ class CreateRules:
 
     def __post_init__(self) -> None:
         _check_choice(self, "frame_walls", FrameWalls)
-        for name, low in (
-            ("step_limit", 0),
-            ("stop_speed", 0),
-            ("min_tool_distance", 0),
-            ("task_id", -1),
+        for name, low, high in (
+            ("step_limit", 0, MAX_STEPS),
+            ("stop_speed", 0, 1e9),
+            ("min_tool_distance", 0, 1e9),
+            ("move_threshold", 0, 1),
+            ("task_id", -1, 2**32 - 1),
         ):
-            _check_range(self, name, low)
-        _check_range(self, "move_threshold", 0, 1)
+            _check_range(self, name, low, high)
 
 
 @dataclass(frozen=True)
@@ -143,7 +145,7 @@ class CreateConfig(CreateRules):
       action_ids: "set": an action's index is a place in this episode's set. "universe": it is a
         tool's id and no set is drawn (the rollout owns the sets).
       observation: "gray" uint8[84, 84], "rgb" uint8[84, 84, 3], or "none" (physics only).
-      render_size: pixels of an observation's side.
+      render_size: pixels of an observation's side, 1 to 4096.
 
     Raises:
       ValueError: a value is no choice, or out of its range.
@@ -165,8 +167,8 @@ class CreateConfig(CreateRules):
             ("observation", Observation),
         ):
             _check_choice(self, name, choices)
-        for name, low in (("action_set_size", 2), ("render_size", 1)):
-            _check_range(self, name, low)
+        for name, low, high in (("action_set_size", 2, 100_000), ("render_size", 1, MAX_PIXELS)):
+            _check_range(self, name, low, high)
 
     @classmethod
     def from_plain(cls, plain: Mapping[str, Any]) -> CreateConfig:
@@ -200,9 +202,7 @@ def _check_choice(config: object, name: str, choices: Any) -> None:
         raise ValueError(f"{name}={value!r} must be one of {get_args(choices)}.")
 
 
-def _check_range(config: object, name: str, low: float, high: float = math.inf) -> None:
+def _check_range(config: object, name: str, low: float, high: float) -> None:
     value = getattr(config, name)
-    if not (low <= value <= high and math.isfinite(value)):
-        limits = "finite" if math.isinf(low) else f"at least {low} and finite"
-        limits += "" if math.isinf(high) else f", at most {high}"
-        raise ValueError(f"{name}={value} must be {limits}.")
+    if not low <= value <= high:  # NaN neither.
+        raise ValueError(f"{name}={value} must be from {low:,.9g} to {high:,.9g}.")

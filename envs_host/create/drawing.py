@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from envs_host.create.colors import RGB_OF_INK, Ink
+from envs_host.create.config import MAX_PIXELS
 from envs_host.create.forms import WHITE_GRAY, fixed_print_of, print_of
 from envs_host.create.sprites import Kind, Sprite
 
@@ -51,8 +52,8 @@ def draw(
     if extras:
         raise ValueError(f"{sorted(extras)} are for mode='people', not for {mode!r}.")
     size = OBSERVATION_SIZE if size is None else size
-    if size < 1:
-        raise ValueError(f"size={size} must be at least 1 pixel.")
+    if not 1 <= size <= MAX_PIXELS:
+        raise ValueError(f"size={size} must be 1 to {MAX_PIXELS} pixels.")
     if mode == "gray":
         return _draw_grays(sprites, size)
     return np.take(RGB_OF_INK, _draw_inks(sprites, size), axis=0)

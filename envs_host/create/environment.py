@@ -52,6 +52,9 @@ class CreateEnv(gymnasium.Env):
     Start: the level's positions, plus noise unless `deterministic`. Noise and action sets come from
     the seed given to `reset`.
 
+    Copies between two steps, by `copy.deepcopy` or `pickle`, go on as the original does, to the
+    bit; nobody watches them. They take as long as the episode's actions so far.
+
         env = CreateEnv("Push", config=CreateConfig(observation="none"))
         observation, info = env.reset(seed=0)
         action = {"index": 1, "position": np.array([0.6, -0.05], np.float32)}
@@ -93,11 +96,10 @@ class CreateEnv(gymnasium.Env):
         self._tools = all_tools(self.config.angle_spacing)
         self._candidates = self._checked_candidates(candidates)
         self._sampler = sampler
-        self._drawing = None if self.config.observation == "none" else _load(_DRAWING)
+        self._draw = None if self.config.observation == "none" else _load(_DRAWING).draw
         # Called after every 4 substeps, for films.
         self.watch: Callable[[World], None] | None = None
-        self._films = None if render_mode is None else _load(_FILMS)
-        self._trail = None if self._films is None else self._films.Trail()
+        self._trail = None if render_mode is None else _load(_FILMS).Trail()
         self._render_options = render_options
         self._available = np.arange(len(self._tools), dtype=np.int32)
         self._episode: Episode | None = None
@@ -189,10 +191,15 @@ class CreateEnv(gymnasium.Env):
 
     def render(self) -> np.ndarray | None:
         """uint8[size, size, 3] picture for people, if the render mode is "rgb_array"."""
-        if self._films is None:
+        if self._trail is None:
             return None
-        options = self._render_options or self._films.DEFAULT_OPTIONS
-        return self._films.picture(self.world, self._trail, self.episode.summary, options)
+        films = _load(_FILMS)
+        options = self._render_options or films.DEFAULT_OPTIONS
+        picture: np.ndarray = films.picture(self.world, self._trail, self.episode.summary, options)
+        return picture
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "watch": None}
 
     def _show(self, world: World) -> None:
         """Lets those who follow the world between decisions see it."""
@@ -208,11 +215,12 @@ class CreateEnv(gymnasium.Env):
         return draw_layout(self.level, rng)
 
     def _observe(self) -> np.ndarray:
-        if self._drawing is None:
+        if self._draw is None:
             return np.zeros(0, np.uint8)
-        return self._drawing.draw(
+        frame: np.ndarray = self._draw(
             self.world.sprites(), mode=self.config.observation, size=self.config.render_size
         )
+        return frame
 
     def _info(self, placement: Placement) -> dict[str, Any]:
         return {

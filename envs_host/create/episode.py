@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
+from typing import Any
 
 from envs_host.create.config import CreateConfig
 from envs_host.create.geometry import Point, clip, is_in_bounds, scaled_distance
@@ -69,9 +70,14 @@ class Episode:
     """An episode under way. An action is `simulate`, then (after drawing) `judge`.
 
     The picture of an action still shows the subgoals that `judge` then removes.
+
+    A copy (`copy.deepcopy`, `pickle`) plays the actions that were judged again: the engine's memory
+    of what touches what, on which the last digits depend, cannot be copied.
     """
 
     def __init__(self, layout: Layout, config: CreateConfig) -> None:
+        self._layout = layout
+        self._actions: list[tuple[Tool, Point]] = []
         self.config = config
         self.level = layout.level
         self.step_limit = config.step_limit or self.level.step_limit
@@ -102,11 +108,13 @@ class Episode:
         watch_every: int = 4,
     ) -> None:
         """Tries to place the tool and runs the world."""
+        self._action = tool, position
         self._placement = self.world.place(tool, clip(position))
         self.world.run(self.config.physics.substeps, watch, watch_every)
 
     def judge(self) -> Outcome:
         """Rewards and ends of the action just simulated."""
+        self._actions.append(self._action)
         summary = self.summary
         reward = self.config.rewards.alive + self._placement_reward()
         summary.length += 1
@@ -129,6 +137,9 @@ class Episode:
         summary.subgoal_reward += subgoals
         summary.dense_reward += dense
         return Outcome(reward, self._placement, tuple(ends))
+
+    def __reduce__(self) -> tuple[Callable[..., Episode], tuple[Any, ...]]:
+        return _replayed, (self._layout, self.config, self._actions)
 
     def _placement_reward(self) -> float:
         """Counts the outcome of the placement and gives its reward."""
@@ -189,3 +200,13 @@ class Episode:
             gain += scaled_distance(start.target, start.marker)
             gain -= scaled_distance(now.target, now.marker)
         return scale * gain
+
+
+def _replayed(
+    layout: Layout, config: CreateConfig, actions: Sequence[tuple[Tool, Point]]
+) -> Episode:
+    """An episode in which these actions were done."""
+    episode = Episode(layout, config)
+    for action in actions:
+        episode.step(*action)
+    return episode

@@ -81,7 +81,9 @@ fixed_print_of = lru_cache(maxsize=2048)(print_of)
 
 
 def _form(pixels: np.ndarray, size: int, inks: np.ndarray | None = None) -> Form:
-    (top, left), (bottom, right) = pixels.min(axis=0).tolist(), pixels.max(axis=0).tolist()
+    # What is too small for a pixel of the picture has none.
+    corners = pixels if len(pixels) else np.zeros((1, 2), int)
+    (top, left), (bottom, right) = corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
     offsets = pixels[:, 0] * size - pixels[:, 1]
     grays = None if inks is None else GRAY_OF_INK[inks]
     return Form(pixels, offsets, (top, bottom, left, right), inks, grays)

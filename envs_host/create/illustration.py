@@ -10,6 +10,7 @@ import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
 from envs_host.create.colors import COLOR_OF_TONE, Color
+from envs_host.create.config import MAX_PIXELS
 from envs_host.create.geometry import Point
 from envs_host.create.pen import Pen, blend, darker
 from envs_host.create.portraits import portray
@@ -71,8 +72,8 @@ def illustrate(
     Raises:
       ValueError: `size` is too small.
     """
-    if size < _SMALLEST:
-        raise ValueError(f"size={size} is too small to see anything; use {_SMALLEST} or more.")
+    if not _SMALLEST <= size <= MAX_PIXELS:
+        raise ValueError(f"size={size} must be {_SMALLEST} to {MAX_PIXELS} pixels.")
     ground = GROUND_AFTER_SUCCESS if is_success else GROUND
     pen = Pen(size, ground)
     for trace in traces:

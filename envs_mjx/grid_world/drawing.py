@@ -82,10 +82,10 @@ def draw_state(
       uint8[height, width, 3] RGB; width and, without caption, height are `pixels // 9 * 9`.
 
     Raises:
-      ValueError: `pixels` is below 90.
+      ValueError: `pixels` is not 90 to 4096.
     """
-    if pixels < 10 * GRID_SIZE:
-        raise ValueError(f"pixels={pixels} is too small to see anything; use 90 or more.")
+    if not 10 * GRID_SIZE <= pixels <= 4096:
+        raise ValueError(f"pixels={pixels} must be 90 to 4,096.")
     size = pixels // GRID_SIZE * GRID_SIZE
     cell = size // GRID_SIZE * _OVERSAMPLING
     image = _draw_layout(int(state.layout), cell).copy()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -42,11 +41,12 @@ class GridWorldSettings:
     """What a run may set; the defaults are the published task.
 
     Attributes:
-      max_moves: moves after which an episode is truncated, 1 or more; also the number that the time
-        penalty is relative to.
-      subgoal_reward: of the first visit to the opening; finite.
-      goal_reward: of the goal before the time penalty; finite.
-      time_penalty: subtracted at the goal, times `num_moves / max_moves`; finite.
+      max_moves: moves after which an episode is truncated, 1 to 10,000; also the number that the
+        time penalty is relative to.
+      subgoal_reward: of the first visit to the opening.
+      goal_reward: of the goal before the time penalty.
+      time_penalty: subtracted at the goal, times `num_moves / max_moves`; like the two rewards, a
+        million at most, either way.
       fixed_layout: 0..41 plays this layout always; -1 draws one of the 42 at every reset.
 
     Raises:
@@ -60,16 +60,16 @@ class GridWorldSettings:
     fixed_layout: int = -1
 
     def __post_init__(self) -> None:
-        if self.max_moves < 1:
-            raise ValueError(f"max_moves={self.max_moves} must be 1 or more.")
+        if not 1 <= self.max_moves <= 10_000:
+            raise ValueError(f"max_moves={self.max_moves} must be 1 to 10,000.")
         if not -1 <= self.fixed_layout < NUM_LAYOUTS:
             raise ValueError(
                 f"fixed_layout={self.fixed_layout} must be 0 to {NUM_LAYOUTS - 1}, or -1 to draw a "
                 "layout at every reset."
             )
         for name in ("subgoal_reward", "goal_reward", "time_penalty"):
-            if not math.isfinite(getattr(self, name)):
-                raise ValueError(f"{name}={getattr(self, name)} must be a finite number.")
+            if not -1e6 <= getattr(self, name) <= 1e6:  # NaN neither.
+                raise ValueError(f"{name}={getattr(self, name)} must be a million at most.")
 
 
 @struct.dataclass

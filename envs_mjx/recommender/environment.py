@@ -28,7 +28,7 @@ class RecommenderSettings:
     """What a run may set; the default is the published task.
 
     Attributes:
-      max_recommendations: recommendations after which an episode is cut, 1 or more.
+      max_recommendations: recommendations after which an episode is cut, 1 to 10,000.
 
     Raises:
       ValueError: the number is out of its range.
@@ -37,8 +37,8 @@ class RecommenderSettings:
     max_recommendations: int = 100
 
     def __post_init__(self) -> None:
-        if self.max_recommendations < 1:
-            raise ValueError(f"max_recommendations={self.max_recommendations} must be 1 or more.")
+        if not 1 <= self.max_recommendations <= 10_000:
+            raise ValueError(f"max_recommendations={self.max_recommendations} must be 1 to 10,000.")
 
 
 @struct.dataclass

@@ -18,6 +18,7 @@ from envs_mjx.shape_stacking.scene import TABLE_HEIGHT
 from envs_mjx.shape_stacking.shapes import Shape, shape_library
 
 FRAME_SIZE = 84
+MAX_PIXELS = 4096  # Of the side of a picture.
 # The table as it is drawn: half-sizes along x and y, m, and gray.
 TABLE_HALF_SIZES = (4.0, 2.0)
 TABLE_COLOR = 0.9
@@ -152,10 +153,10 @@ def render_rgb(
       uint8[size, size, 3] RGB, row 0 on top.
 
     Raises:
-      ValueError: there is no pixel.
+      ValueError: there is no pixel, or there are too many.
     """
-    if size < 1:
-        raise ValueError(f"size={size} must be 1 or more.")
+    if not 1 <= size <= MAX_PIXELS:
+        raise ValueError(f"size={size} must be 1 to {MAX_PIXELS:,} pixels.")
     library = shape_library(shapes)
     ids = jnp.asarray(shape_ids, jnp.int32)
     chex.assert_rank(ids, 1)

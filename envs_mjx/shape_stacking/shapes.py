@@ -23,6 +23,7 @@ DENSITY = 1000.0
 NUM_SHAPES = 810
 # Of a user's own shapes; the published ones have 0.08 to 0.64 m.
 SCALES_M = (0.01, 1.0)
+MAX_SHAPES = 10_000  # In a file.
 FILE_HEADER = ("solid", "scale", "yaw_deg", "red", "green", "blue")
 _FILE_LINE = "cube,0.25,33,0.9,0.2,0.1"
 
@@ -125,6 +126,8 @@ def load_shapes(path: str | Path) -> tuple[Shape, ...]:
                 shapes.append(_shape(line))
             except ValueError as err:
                 raise ValueError(f"{path}, line {lines.line_num}: {err}") from err
+    if len(shapes) > MAX_SHAPES:
+        raise ValueError(f"{path} has {len(shapes):,} shapes; {MAX_SHAPES:,} are the most.")
     if not shapes:
         raise ValueError(f"{path} has no shapes; give one a line, such as {_FILE_LINE}")
     return tuple(shapes)

@@ -14,9 +14,14 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from envs_host.pool import HostPool
+from tests.envs_host.pool_toys import FAULTY
 
 ROOT = Path(__file__).resolve().parents[2]
 PROC = Path("/proc")
@@ -86,6 +91,31 @@ def test_parent_is_killed(kind: str, number: signal.Signals) -> None:
         os.kill(process.pid, number)
         assert assert_nothing_left(process, pids) == ""
     assert process.returncode == -number
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(
+    sys.platform != "linux", reason="only Linux tells a process of its parent's end"
+)
+def test_parent_is_killed_while_its_workers_are_stopped() -> None:
+    with parent("steps") as (process, pids):
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)
+        os.kill(process.pid, signal.SIGKILL)
+        assert assert_nothing_left(process, pids) == ""
+
+
+@pytest.mark.integration
+def test_the_thread_that_started_the_workers_may_end() -> None:
+    """Linux takes it for the parent's end, and the pool still needs them."""
+    with ThreadPoolExecutor(1) as executor:
+        pool = executor.submit(HostPool, FAULTY, {"fault": "hang"}, 4, 2, 0).result()
+    with pool:
+        pool.reset()
+        pids = pool.worker_pids
+        for _ in range(3):
+            pool.step(np.zeros(4, int), np.zeros((4, 2)))
+        assert pool.worker_pids == pids
 
 
 @pytest.mark.integration

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import re
+import signal
 from typing import Any
 
 import pytest
@@ -51,6 +52,17 @@ def test_help_lists_the_flags_of_the_project(
     assert listed(text) == ours
     run(monkeypatch, name, "--helpfull")
     assert listed(capsys.readouterr().out) >= ours | {"verbosity", "logtostderr", "pdb"}
+
+
+def test_a_child_ends_with_its_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    sent: list[signal.Signals] = []
+    monkeypatch.setattr(main, "signal_at_parents_end", sent.append)
+    monkeypatch.setattr("os.environ", main.child("train")[1])
+    with pytest.raises(SystemExit, match="which started this one, is gone"):
+        run(monkeypatch)  # This process did not start itself.
+    assert sent == [signal.SIGTERM]
+    run(monkeypatch)  # Its own children are not told.
+    assert sent == [signal.SIGTERM]
 
 
 @pytest.mark.parametrize("words", [(), ("--help",), ("-h",), ("help",)])

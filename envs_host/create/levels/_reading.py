@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 from envs_host.create.geometry import Point
-from envs_host.create.levels.object_types import Parameter, Value
+from envs_host.create.levels.object_types import POSITION, Parameter, Value
 
+MAX_ITEMS = 1000  # Of a list: a world with as many things still takes about a second to draw.
 _MISSING = object()
 
 
@@ -30,7 +31,9 @@ class Reader:
     def error(self, name: str, got: object, allowed: str) -> LevelError:
         """The error for a field, to be raised."""
         place = ".".join(part for part in (self.path, name) if part) or "the level"
-        return LevelError(f"{self.source}: {place} is {got!r}; it must be {allowed}.")
+        text = repr(got)
+        text = text if len(text) < 100 else f"{text[:100]}..."
+        return LevelError(f"{self.source}: {place} is {text}; it must be {allowed}.")
 
     def finish(self) -> None:
         """Raises if the object holds a field that nobody has asked for."""
@@ -78,33 +81,22 @@ class Reader:
             raise self.error(name, value, f"one of {tuple(choices)}")
         return value
 
-    def whole(self, name: str, default: int, low: int) -> int:
+    def whole(self, name: str, default: int, low: int, high: int) -> int:
         value = self._take(name, default)
-        if isinstance(value, bool) or not isinstance(value, int) or value < low:
-            raise self.error(name, value, f"a whole number of at least {low}")
+        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+            raise self.error(name, value, f"a whole number from {low} to {high}")
         return value
 
-    def number(
-        self,
-        name: str,
-        default: Any = _MISSING,
-        low: float = -math.inf,
-        above: float | None = None,
-    ) -> float:
-        is_open = above is not None
-        parameter = Parameter("number", low=above if above is not None else low, is_open=is_open)
-        return self._number(name, self._take(name, default), parameter)
-
     def point(self, name: str) -> Point:
-        return self._pair(name, self._take(name))
+        return self._pair(name, self._take(name), POSITION)
 
     def points(self, name: str) -> tuple[Point, ...]:
         """A list of positions; none if it is missing."""
         items = self._list(name, [])
-        return tuple(self._pair(f"{name}[{i}]", item) for i, item in enumerate(items))
+        return tuple(self._pair(f"{name}[{i}]", item, POSITION) for i, item in enumerate(items))
 
     def interval(self, name: str) -> Point:
-        low, high = self._pair(name, self._take(name))
+        low, high = self.point(name)
         if low > high:
             raise self.error(name, [low, high], "[low, high] with low <= high")
         return low, high
@@ -114,7 +106,7 @@ class Reader:
         default = _MISSING if parameter.default is None else parameter.default
         value = self._take(name, default, parameter.allowed)
         if parameter.kind == "pair":
-            return self._pair(name, value)
+            return self._pair(name, value, parameter)
         if parameter.kind == "choice":
             if value not in parameter.choices:
                 raise self.error(name, value, parameter.allowed)
@@ -134,24 +126,26 @@ class Reader:
         value = self._take(name, default)
         if not isinstance(value, list):
             raise self.error(name, value, "a list [ ... ]")
+        if len(value) > MAX_ITEMS:
+            raise LevelError(
+                f"{self.source}: {self._place(name)} has {len(value):,} entries; it must have "
+                f"{MAX_ITEMS:,} at most."
+            )
         return value
 
     def _number(self, name: str, value: object, parameter: Parameter) -> float:
         is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        if not is_number or not math.isfinite(value):  # type: ignore[arg-type]
+        # False for NaN; whole numbers of any size can be compared.
+        if not is_number or not parameter.low <= value <= parameter.high:  # type: ignore[operator]
             raise self.error(name, value, parameter.allowed)
-        number = float(value)  # type: ignore[arg-type]
-        too_low = number <= parameter.low if parameter.is_open else number < parameter.low
-        if too_low or number > parameter.high:
-            raise self.error(name, value, parameter.allowed)
-        return number
+        return float(value)  # type: ignore[arg-type]
 
-    def _pair(self, name: str, value: object) -> Point:
+    def _pair(self, name: str, value: object, parameter: Parameter) -> Point:
         if not isinstance(value, list | tuple) or len(value) != 2:
-            raise self.error(name, value, "two numbers [x, y]")
-        plain = Parameter("number")
-        return self._number(f"{name}[0]", value[0], plain), self._number(
-            f"{name}[1]", value[1], plain
+            raise self.error(name, value, parameter.allowed)
+        each = replace(parameter, kind="number")
+        return self._number(f"{name}[0]", value[0], each), self._number(
+            f"{name}[1]", value[1], each
         )
 
     def _place(self, name: str) -> str:

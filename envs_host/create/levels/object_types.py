@@ -10,6 +10,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
+from envs_host.create.geometry import WORLD_SIZE
+
 Value = float | str | tuple[float, float]
 
 TONES = ("scenery", "frame", "black", "marker", "tool", "bouncy_tool")
@@ -23,15 +25,14 @@ class Parameter:
     Attributes:
       kind: which of the three.
       default: used if the level says nothing; None: the level has to say.
-      low, high: numbers lie in [low, high]; with `is_open`, above `low`.
+      low, high: numbers lie in [low, high], those of a pair each.
       choices: of a "choice".
     """
 
     kind: str
     default: Value | None = None
-    low: float = -math.inf
-    high: float = math.inf
-    is_open: bool = False
+    low: float = 0.0
+    high: float = 0.0
     choices: tuple[str, ...] = ()
 
     @property
@@ -39,23 +40,39 @@ class Parameter:
         """The legal values in words."""
         if self.kind == "choice":
             return f"one of {self.choices}"
-        what = "a number" if self.kind == "number" else "two numbers [x, y]"
-        low = f" above {self.low:g}" if self.is_open else f" of at least {self.low:g}"
-        low = "" if math.isinf(self.low) else low
-        high = "" if math.isinf(self.high) else f", at most {self.high:g}"
-        return f"{what}{low}{high}"
+        what = "a number" if self.kind == "number" else "two numbers [x, y], each"
+        return f"{what} from {self.low:,.9g} to {self.high:,.9g}"
 
 
-def _positive(default: float | None = None) -> Parameter:
-    return Parameter("number", default, low=0.0, is_open=True)
+def _length(default: float | None = None) -> Parameter:
+    """Units: a radius, a side, a length. From a pixel to twice the side of the world."""
+    return Parameter("number", default, 1.0, 2.0 * WORLD_SIZE)
 
 
-def _at_least_zero(default: float | None = None) -> Parameter:
-    return Parameter("number", default, low=0.0)
+def _mass(default: float | None = None) -> Parameter:
+    return Parameter("number", default, 0.01, 10_000.0)
 
 
-def _number(default: float | None = None) -> Parameter:
-    return Parameter("number", default)
+def _elasticity(default: float) -> Parameter:
+    """Of two that touch, the product counts; above 1 they part faster than they met."""
+    return Parameter("number", default, 0.0, 2.0)
+
+
+def _friction(default: float) -> Parameter:
+    return Parameter("number", default, 0.0, 100.0)
+
+
+def _angle(default: float | None = None) -> Parameter:
+    return Parameter("number", default, -360.0, 360.0)
+
+
+def _push(default: float | None = None) -> Parameter:
+    """An impulse or a force."""
+    return Parameter("number", default, -10_000.0, 10_000.0)
+
+
+def _velocity(default: tuple[float, float]) -> Parameter:
+    return Parameter("pair", default, -1_000.0, 1_000.0)
 
 
 def _tone(default: str) -> Parameter:
@@ -67,74 +84,78 @@ def _ladder_velocity(speed: float) -> tuple[float, float]:
     return 4.0 * speed * math.cos(math.radians(95.0)), speed * math.sin(math.radians(95.0))
 
 
-_ELASTICITY = _at_least_zero(0.5)
-_FRICTION = _at_least_zero(1.0)
+# Of positions and their offsets, normalised: a world's width beyond its edges.
+POSITION = Parameter("pair", None, -3.0, 3.0)
+REWARD = Parameter("number", None, -1e6, 1e6)
+
 _PLANK_FRICTION = Parameter("number", 1.0, low=1.0, high=2.0)
-_MAX_ANGLE = Parameter("number", None, low=0.0, high=90.0, is_open=True)
-_BALL = {
-    "radius": _positive(4.0),
-    "mass": _positive(10.0),
-    "elasticity": _at_least_zero(1.0),
-    "friction": _FRICTION,
+_MAX_ANGLE = Parameter("number", None, low=0.1, high=90.0)
+BALL = {
+    "radius": _length(4.0),
+    "mass": _mass(10.0),
+    "elasticity": _elasticity(1.0),
+    "friction": _friction(1.0),
 }
-_CATCHER = {"angle_deg": _number(0.0), "circumradius": _positive()}
+STAR = {"circumradius": _length(4.0)}
+BASKET = {"sensor_square": _length(10.0)}
+_CATCHER = {"angle_deg": _angle(0.0), "circumradius": _length()}
 
 BASIC_TYPES: Mapping[str, Mapping[str, Parameter]] = {
     "bar": {
-        "angle_deg": _number(0.0),
-        "length": _positive(16.0),
-        "thickness": _positive(2.0),
-        "elasticity": _ELASTICITY,
-        "friction": _FRICTION,
+        "angle_deg": _angle(0.0),
+        "length": _length(16.0),
+        "thickness": _length(2.0),
+        "elasticity": _elasticity(0.5),
+        "friction": _friction(1.0),
         "tone": _tone("scenery"),
     },
     "trampoline": {
-        "angle_deg": _number(0.0),
-        "length": _positive(16.0),
-        "elasticity": _at_least_zero(1.2),
-        "friction": _FRICTION,
+        "angle_deg": _angle(0.0),
+        "length": _length(16.0),
+        "elasticity": _elasticity(1.2),
+        "friction": _friction(1.0),
     },
-    "marker_ball": {**_BALL, "tone": _tone("marker")},
-    "dynamic_ball": {**_BALL, "tone": _tone("black")},
+    "marker_ball": {**BALL, "tone": _tone("marker")},
+    "dynamic_ball": {**BALL, "tone": _tone("black")},
     "dynamic_box": {
-        "size": _positive(5.0),
-        "mass": _positive(10.0),
-        "elasticity": _at_least_zero(0.1),
-        "friction": _FRICTION,
+        "size": _length(5.0),
+        "mass": _mass(10.0),
+        "elasticity": _elasticity(0.1),
+        "friction": _friction(1.0),
     },
     "disc": {
-        "radius": _positive(),
-        "elasticity": _ELASTICITY,
-        "friction": _at_least_zero(0.0),
+        "radius": _length(),
+        "elasticity": _elasticity(0.5),
+        "friction": _friction(0.0),
         "tone": _tone("tool"),
     },
     "polygon": {
         "sides": Parameter("number", None, low=3.0, high=12.0),
-        "circumradius": _positive(),
-        "angle_deg": _number(0.0),
-        "elasticity": _ELASTICITY,
-        "friction": _FRICTION,
+        "circumradius": _length(),
+        "angle_deg": _angle(0.0),
+        "elasticity": _elasticity(0.5),
+        "friction": _friction(1.0),
         "tone": _tone("tool"),
     },
-    "lever": {"length": _positive(), "friction": _PLANK_FRICTION},
+    "lever": {"length": _length(), "friction": _PLANK_FRICTION},
     "limited_see_saw": {
-        "length": _positive(),
+        "length": _length(),
         "max_angle_deg": _MAX_ANGLE,
         "friction": _PLANK_FRICTION,
     },
     "see_saw": {
-        "length": _positive(),
+        "length": _length(),
         "max_angle_deg": _MAX_ANGLE,
         "weight_side": Parameter("choice", choices=WEIGHT_SIDES),
-        "weight_mass": _positive(),
+        "weight_mass": _mass(),
     },
-    "cannon": {"angle_deg": _number(), "impulse": _number()},
-    "fan": {"angle_deg": _number(), "force": _number()},
-    "belt": {"length": _positive(20.0), "velocity": Parameter("pair", (5.0, 0.0))},
+    "cannon": {"angle_deg": _angle(), "impulse": _push()},
+    "fan": {"angle_deg": _angle(), "force": _push()},
+    "belt": {"length": _length(20.0), "velocity": _velocity((5.0, 0.0))},
     "ladder": {
-        "angle_deg": _number(95.0),
-        "length": _positive(20.0),
-        "velocity": Parameter("pair", _ladder_velocity(4.0)),
+        "angle_deg": _angle(95.0),
+        "length": _length(20.0),
+        "velocity": _velocity(_ladder_velocity(4.0)),
     },
     "funnel": _CATCHER,
     "bucket": _CATCHER,

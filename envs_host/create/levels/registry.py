@@ -62,7 +62,7 @@ def parse_level(text: str, source: str = "the text") -> Level:
     """
     try:
         record = json.loads(text)
-    except json.JSONDecodeError as err:
+    except (ValueError, RecursionError) as err:
         raise LevelError(f"{source} is not JSON: {err}. See levels.schema for the fields.") from err
     return read_level(record, source)
 
@@ -124,4 +124,8 @@ def _read_file(path: Path) -> Level:
         raise LevelError(
             f"{path} is no file; give a level's name {level_names()} or its JSON file."
         )
-    return parse_level(path.read_text(), str(path))
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as err:
+        raise LevelError(f"{path} cannot be read as text: {err}.") from err
+    return parse_level(text, str(path))

@@ -18,9 +18,10 @@ A file is one JSON object:
                             {"members": [..], "choice": [offset, ..]} one of them
     objects                 list of {"key", "type", "pos", parameters of the type}
 
-Positions are normalised, [x, y] in [-1, 1], y up; lengths are units of the 84-unit world, angles
-degrees counter-clockwise. Members of noise groups are `target`, `goal` and keys of objects. A
-marker level has one object of type `marker_ball`. `object_types` lists types and parameters.
+Positions are normalised, [x, y] with the world in [-1, 1], y up; lengths are units of the 84-unit
+world, angles degrees counter-clockwise. Members of noise groups are `target`, `goal` and keys of
+objects. A marker level has one object of type `marker_ball`. `object_types` lists types, parameters
+and the range of every number.
 """
 
 from __future__ import annotations
@@ -31,9 +32,19 @@ from dataclasses import dataclass, field
 
 from envs_host.create.geometry import Point
 from envs_host.create.levels._reading import LevelError, Reader
-from envs_host.create.levels.object_types import ALL_TYPES, Value, resolve
+from envs_host.create.levels.object_types import (
+    ALL_TYPES,
+    BALL,
+    BASKET,
+    REWARD,
+    STAR,
+    Parameter,
+    Value,
+    resolve,
+)
 
 SCHEMA = 1
+MAX_STEPS = 10_000
 KINDS = ("marker", "plain")
 GOAL_KINDS = ("star", "ball", "basket")
 LOOKS = ("target", "basketball")
@@ -46,11 +57,11 @@ class BallSpec:
     """A dynamic ball: normalised position, radius in units, mass, surface, look."""
 
     pos: Point
-    radius: float = 4.0
-    mass: float = 10.0
-    elasticity: float = 1.0
-    friction: float = 1.0
-    look: str = "target"
+    radius: float
+    mass: float
+    elasticity: float
+    friction: float
+    look: str
 
 
 @dataclass(frozen=True)
@@ -141,7 +152,7 @@ def read_level(record: object, source: str) -> Level:
     level = Level(
         name=name,
         kind=kind,
-        step_limit=reader.whole("step_limit", default=30, low=1),
+        step_limit=reader.whole("step_limit", default=30, low=1, high=MAX_STEPS),
         frame_walls=reader.flag("frame_walls"),
         marker_must_hit_target=reader.flag("marker_must_hit_target"),
         reward_overrides=_read_rewards(reader.child("reward_overrides", optional=True)),
@@ -159,19 +170,16 @@ def read_level(record: object, source: str) -> Level:
 
 
 def _read_rewards(reader: Reader) -> dict[str, float]:
-    rewards = {name: reader.number(name) for name in REWARD_NAMES if name in reader.record}
+    rewards = _numbers(reader, {n: REWARD for n in REWARD_NAMES if n in reader.record})
     reader.finish()
     return rewards
 
 
 def _read_ball(reader: Reader) -> BallSpec:
     ball = BallSpec(
-        pos=reader.point("pos"),
-        radius=reader.number("radius", default=4.0, above=0.0),
-        mass=reader.number("mass", default=10.0, above=0.0),
-        elasticity=reader.number("elasticity", default=1.0, low=0.0),
-        friction=reader.number("friction", default=1.0, low=0.0),
+        reader.point("pos"),
         look=reader.choice("look", LOOKS, default="target"),
+        **_numbers(reader, BALL),
     )
     reader.finish()
     return ball
@@ -182,13 +190,15 @@ def _read_goal(reader: Reader) -> GoalSpec:
     if kind == "ball":
         ball = _read_ball(reader)
         return GoalSpec(kind, ball.pos, ball.radius, ball)
-    if kind == "star":
-        size = reader.number("circumradius", default=4.0, above=0.0)
-    else:
-        size = reader.number("sensor_square", default=10.0, above=0.0)
+    (size,) = _numbers(reader, STAR if kind == "star" else BASKET).values()
     goal = GoalSpec(kind, reader.point("pos"), size)
     reader.finish()
     return goal
+
+
+def _numbers(reader: Reader, parameters: Mapping[str, Parameter]) -> dict[str, float]:
+    values = {name: reader.parameter(name, p) for name, p in parameters.items()}
+    return {name: value for name, value in values.items() if isinstance(value, float)}
 
 
 def _read_object(reader: Reader) -> ObjectSpec:

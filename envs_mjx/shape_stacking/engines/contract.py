@@ -61,6 +61,16 @@ class Engine(Protocol):
         ...
 
 
+def check_settle_steps(settle_steps: int) -> None:
+    """Refuses fewer than 1 physics step, and more than 100,000.
+
+    Raises:
+      ValueError: it is one of these.
+    """
+    if not 1 <= settle_steps <= 100_000:
+        raise ValueError(f"settle_steps={settle_steps} must be 1 to 100,000.")
+
+
 def check_state(
     shape_ids: jax.Array | np.ndarray, qpos: jax.Array | np.ndarray, qvel: jax.Array | np.ndarray
 ) -> None:

@@ -12,7 +12,12 @@ import mujoco
 
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines import _mjx_private, mjx_pool
-from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.contract import (
+    Settled,
+    check_settle_steps,
+    check_state,
+    is_plausible,
+)
 from envs_mjx.shape_stacking.engines.mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
@@ -57,10 +62,10 @@ class Mjx:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's.
+          settle_steps: 1 to 100,000; 300 is the task's.
           num_slots: 2 to 12. Arrays have 12 rows whatever it is; with fewer slots, which is
             cheaper, worlds that use a body beyond them are not `ok`.
-          max_contacts: points of contact in a world, at least 1; the deepest are kept.
+          max_contacts: points of contact in a world, 1 to 1,000; the deepest are kept.
           solver: upper bounds of Newton's method.
           limits: of the pairs of bodies that are looked at closely; None for the usual ones.
           shapes: of the user's own.
@@ -69,12 +74,11 @@ class Mjx:
           ValueError: a number is out of its range.
           ImportError: another version of mujoco-mjx than this was written for.
         """
-        if settle_steps < 1:
-            raise ValueError(f"settle_steps={settle_steps} must be at least 1.")
+        check_settle_steps(settle_steps)
         if not 2 <= num_slots <= NUM_SLOTS:
             raise ValueError(f"num_slots={num_slots} must be 2 to {NUM_SLOTS}.")
-        if max_contacts < 1:
-            raise ValueError(f"max_contacts={max_contacts} must be at least 1.")
+        if not 1 <= max_contacts <= 1_000:
+            raise ValueError(f"max_contacts={max_contacts} must be 1 to 1,000.")
         _mjx_private.check_version()
         self.settle_steps = settle_steps
         self.num_slots = num_slots
@@ -85,12 +89,13 @@ class Mjx:
         self._data = _mjx_private.mjx.make_data(model, impl="jax")
         self._jitted = jax.jit(self._settle_flat)
 
-    def __copy__(self) -> Mjx:
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in vars(self).items() if name != "_jitted"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
         """A copy has a program of its own, so that its `settle_steps` may be changed."""
-        twin = object.__new__(type(self))
-        vars(twin).update(vars(self))
-        twin._jitted = jax.jit(twin._settle_flat)
-        return twin
+        vars(self).update(state)
+        self._jitted = jax.jit(self._settle_flat)
 
     def settle(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         """Simulates `settle_steps` physics steps; arrays as in `engines.Engine.settle`.

@@ -9,7 +9,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from envs_mjx.shape_stacking import scene
-from envs_mjx.shape_stacking.engines.contract import Settled, check_state, is_plausible
+from envs_mjx.shape_stacking.engines.contract import (
+    Settled,
+    check_settle_steps,
+    check_state,
+    is_plausible,
+)
 from envs_mjx.shape_stacking.engines.mujoco_pool import Worlds
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
@@ -53,8 +58,8 @@ class MujocoC:
     ) -> None:
         """
         Args:
-          settle_steps: at least 1; 300 is the task's.
-          num_threads: 0 for one per core that this process may use.
+          settle_steps: 1 to 100,000; 300 is the task's.
+          num_threads: 1 to 1,000; 0 for one per core that this process may use.
           has_multiple_contacts: two hulls touch in several points where their faces or edges lie
             on each other, as in MuJoCo's present defaults and much as in MJX: steadier towers.
           shapes: of the user's own.
@@ -62,10 +67,9 @@ class MujocoC:
         Raises:
           ValueError: a number is out of its range.
         """
-        if settle_steps < 1:
-            raise ValueError(f"settle_steps={settle_steps} must be at least 1.")
-        if num_threads < 0:
-            raise ValueError(f"num_threads={num_threads} must be 0 (one per core) or more.")
+        check_settle_steps(settle_steps)
+        if not 0 <= num_threads <= 1_000:
+            raise ValueError(f"num_threads={num_threads} must be 0 (one per core) to 1,000.")
         self.settle_steps = settle_steps
         self.num_threads = num_threads or available_cores()
         self.shapes = shapes

@@ -11,6 +11,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from functools import lru_cache
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -153,6 +154,7 @@ class Worlds:
         has_multiple_contacts: bool,
         shapes: tuple[Shape, ...] = (),
     ) -> None:
+        self._made_of = capacity, num_threads, has_multiple_contacts, shapes
         self._values = _slot_values(shapes)
         _, self._form_of = scene.forms(shapes)
         model = pool_model(has_multiple_contacts, shapes)
@@ -160,6 +162,9 @@ class Worlds:
         self._fields = {name: self._batch.expand(name) for name in self._values}
         self._qpos, self._qvel = self._batch.bind("qpos"), self._batch.bind("qvel")
         self._warmstart = self._batch.bind("qacc_warmstart")
+
+    def __reduce__(self) -> tuple[type[Worlds], tuple[Any, ...]]:
+        return Worlds, self._made_of
 
     def run(
         self, shape_ids: np.ndarray, qpos: np.ndarray, qvel: np.ndarray, num_steps: int

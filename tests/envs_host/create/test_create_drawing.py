@@ -101,6 +101,16 @@ def test_rows_of_small_discs(radius: int, widths: list[int]) -> None:
     )
 
 
+@pytest.mark.unit
+@pytest.mark.parametrize("size", [1, 5, 13])
+def test_what_is_too_small_for_a_pixel_is_left_out(size: int) -> None:
+    for level in ("Push", "Funnel", "Ladder", "Seesaw"):
+        env = CreateEnv(level, config=CreateConfig(render_size=size))
+        assert env.reset(seed=0)[0].shape == (size, size)
+        for index in (5, 20, 33):
+            env.step({"index": index, "position": [index / 20 - 1, 0.5]})
+
+
 @pytest.mark.golden
 def test_sizes_of_discs_and_star() -> None:
     sizes = {radius: len(raster.disc(radius)) for radius in (1, 3, 4, 9)}
@@ -472,8 +482,9 @@ def test_same_sprites_same_bits() -> None:
     ("arguments", "message"),
     [
         ({"mode": "grey"}, "one of"),
-        ({"size": 0}, "at least 1"),
-        ({"mode": "people", "size": 8}, "16 or more"),
+        ({"size": 0}, "size=0 must be 1 to 4096 pixels"),
+        ({"size": 10**6}, "size=1000000 must be 1 to 4096 pixels"),
+        ({"mode": "people", "size": 8}, "must be 16 to 4096 pixels"),
         ({"caption": "x"}, "for mode='people'"),
     ],
 )

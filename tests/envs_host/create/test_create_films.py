@@ -103,7 +103,7 @@ def test_size_of_a_picture() -> None:
     assert shown.render().shape == (1024, 1024, 3)
     assert draw([], "people").shape == (1024, 1024, 3)
     assert CreateEnv("Push", True, BLIND).render() is None
-    with pytest.raises(ValueError, match="16 or more"):
+    with pytest.raises(ValueError, match="must be 16 to 4096 pixels"):
         illustrate([], 15)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import re
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 from envs_host.create.building import build_object
 from envs_host.create.config import PhysicsConfig
+from envs_host.create.environment import CreateEnv
 from envs_host.create.layout import Layout, draw_layout
 from envs_host.create.levels import (
     TASK_NAMES,
@@ -136,13 +138,13 @@ OBJECT = {"key": "it", "type": "bar", "pos": [0, 0]}
         ({"schema": 2}, r"small.json: schema is 2; it must be one of \(1,\)"),
         ({"kind": "odd"}, r"kind is 'odd'; it must be one of \('marker', 'plain'\)"),
         ({"name": "a b"}, "name is 'a b'; it must be letters and digits"),
-        ({"step_limit": 0}, "step_limit is 0; it must be a whole number of at least 1"),
+        ({"step_limit": 0}, "step_limit is 0; it must be a whole number from 1 to 10000"),
         ({"step_limit": True}, "step_limit is True"),
         ({"frame_walls": 1}, "frame_walls is 1; it must be true or false"),
         ({"target": {}}, "target.pos is missing"),
         ({"target": {"pos": [0]}}, r"target.pos is \[0\]; it must be two numbers"),
         ({"target": {"pos": [0, "up"]}}, r"target.pos\[1\] is 'up'; it must be a number"),
-        ({"target": {"pos": [0, 0], "radius": 0}}, "target.radius is 0; it must be a number above"),
+        ({"target": {"pos": [0, 0], "radius": 0}}, "target.radius is 0; .* number from 1 to 168"),
         ({"target": {"pos": [0, 0], "size": 3}}, "target.size is not a field; allowed here"),
         ({"goal": {"kind": "hole", "pos": [0, 0]}}, "goal.kind is 'hole'"),
         ({"goal": {"kind": "star", "pos": [0, 0], "mass": 1}}, "goal.mass is not a field"),
@@ -151,7 +153,7 @@ OBJECT = {"key": "it", "type": "bar", "pos": [0, 0]}
         ({"objects": {}}, "objects is {}; it must be a list"),
         ({"objects": [3]}, r"objects\[0\] is 3; it must be an object"),
         ({"objects": [{**OBJECT, "type": "puncher"}]}, r"objects\[0\].type is 'puncher'"),
-        ({"objects": [{**OBJECT, "length": -1}]}, r"objects\[0\].length is -1; .* above 0"),
+        ({"objects": [{**OBJECT, "length": -1}]}, r"objects\[0\].length is -1; .* from 1 to 168"),
         ({"objects": [{**OBJECT, "length": "2 * 8"}]}, r"objects\[0\].length is '2 \* 8'"),
         ({"objects": [{**OBJECT, "tone": "pink"}]}, r"objects\[0\].tone is 'pink'; .* one of"),
         ({"objects": [{**OBJECT, "velocity": [1, 0]}]}, r"objects\[0\].velocity is not a field"),
@@ -179,6 +181,97 @@ def test_errors_name_file_field_and_what_is_allowed(changes: dict, message: str)
     assert str(caught.value).startswith("small.json: ")
 
 
+def numbers(level: object, path: str = "") -> dict[str, float]:
+    """Every number of a parsed file by its place."""
+    if isinstance(level, dict | list):
+        items = level.items() if isinstance(level, dict) else enumerate(level)
+        return {k: v for key, item in items for k, v in numbers(item, f"{path}/{key}").items()}
+    return {path: level} if isinstance(level, int | float) and not isinstance(level, bool) else {}
+
+
+# Every field that can hold a number: each type of objects, each kind of goal, both of noise.
+EVERYTHING = [
+    {
+        "kind": "marker",
+        "step_limit": 30,
+        "target": {"pos": [0, 0.5], "radius": 4, "mass": 10, "elasticity": 1, "friction": 1},
+        "goal": goal,
+        "reward_overrides": {"goal": 1, "subgoal": 1, "target_hit": 1},
+        "subgoals": {"for_target": [[0, 0]], "for_marker": [[0, 0]]},
+        "noise": [
+            {"members": ["goal"], "dx": [0, 0], "dy": [0, 0]},
+            {"members": ["target"], "choice": [[0, 0]]},
+        ],
+        "objects": [
+            {
+                **{name: p.default for name, p in BASIC_TYPES[type_name].items()},
+                **GIVEN.get(type_name, {}),
+                "key": f"o{i}",
+                "type": type_name,
+                "pos": [0, 0],
+            }
+            for i, type_name in enumerate(BASIC_TYPES)
+        ],
+    }
+    for goal in (
+        {"kind": "ball", "pos": [0, 0], "radius": 4, "mass": 1, "elasticity": 1, "friction": 1},
+        {"kind": "star", "pos": [0, 0], "circumradius": 4},
+        {"kind": "basket", "pos": [0, 0], "sensor_square": 4},
+    )
+]
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    "value", [math.nan, math.inf, 1e300, -1e300, 10**400], ids=["NaN", "inf", "big", "low", "whole"]
+)
+def test_no_number_is_too_large_for_its_field(value: float) -> None:
+    for level in EVERYTHING:
+        found = numbers(level)
+        assert len(found) > 80
+        read(**level)
+        for path in found:
+            *parents, last = path.strip("/").split("/")
+            changed = at = copy.deepcopy(level)
+            for part in parents:
+                at = at[int(part) if isinstance(at, list) else part]
+            at[int(last) if isinstance(at, list) else last] = value
+            with pytest.raises(LevelError, match=(*parents, last)[0]) as caught:
+                read(**changed)
+            assert re.search(r"must be .*(from|\[low, high\])", str(caught.value)), path
+
+
+@pytest.mark.property
+@pytest.mark.parametrize("end", ["low", "high"])
+def test_what_is_allowed_can_be_simulated_and_drawn(end: str) -> None:
+    """Every object with every number at an end of its range, in the way of ball and marker."""
+    objects = []
+    for i, (type_name, parameters) in enumerate(BASIC_TYPES.items()):
+        values = {
+            name: getattr(p, end) if p.kind == "number" else [getattr(p, end)] * 2
+            for name, p in parameters.items()
+            if p.kind != "choice"
+        }
+        side = {"weight_side": "left"} if type_name == "see_saw" else {}
+        pos = [0.5 * (i % 4) - 0.7, 0.5 * (i // 4) - 0.7]
+        objects.append({"key": f"o{i}", "type": type_name, "pos": pos, **side, **values})
+    env = CreateEnv(read(kind="marker", objects=objects))
+    for seed in range(2):
+        env.reset(seed=seed)
+        for _ in range(3):
+            observation, reward, terminated, *_ = env.step({"index": 0, "position": [0, 0]})
+            assert math.isfinite(reward)
+            assert observation.min() < 255
+            if terminated:
+                break
+
+
+@pytest.mark.unit
+def test_lists_have_an_end() -> None:
+    with pytest.raises(LevelError, match=r"for_target has 1,001 entries; .* 1,000 at most"):
+        read(subgoals={"for_target": [[0, 0]] * 1001})
+
+
 @pytest.mark.unit
 def test_what_is_no_json_or_no_level_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LevelError, match="the text is not JSON"):
@@ -187,6 +280,11 @@ def test_what_is_no_json_or_no_level_is_refused(tmp_path: Path) -> None:
         load_level("Funel")
     with pytest.raises(LevelError, match="is no file"):
         load_level(tmp_path / "absent.json")
+    (tmp_path / "latin.json").write_bytes(b'{"name": "\xfc"}')
+    with pytest.raises(LevelError, match=r"latin\.json cannot be read as text: 'utf-8' codec"):
+        load_level(tmp_path / "latin.json")
+    with pytest.raises(LevelError, match="the text is not JSON: maximum recursion depth"):
+        parse_level("[" * 100_000)
 
 
 @pytest.mark.unit

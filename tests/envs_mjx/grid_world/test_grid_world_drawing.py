@@ -41,8 +41,9 @@ def test_sizes() -> None:
     assert captioned.shape[0] > PIXELS
     assert np.array_equal(captioned[:PIXELS], plain)
     assert len(np.unique(captioned[PIXELS:])) > 2  # there is text
-    with pytest.raises(ValueError, match="too small"):
-        drawing.draw_state(state_at(1, 1), pixels=50)
+    for pixels in (50, 10**6):
+        with pytest.raises(ValueError, match=f"pixels={pixels} must be 90 to 4,096"):
+            drawing.draw_state(state_at(1, 1), pixels=pixels)
 
 
 def test_every_kind_of_cell_looks_different() -> None:

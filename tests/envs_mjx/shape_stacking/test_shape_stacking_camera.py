@@ -96,7 +96,7 @@ def test_a_larger_picture_has_the_pixels_of_the_small_one() -> None:
     # Rounding sends a ray past an edge, and light to the next of 256 levels.
     assert (np.abs(middles - small) > 1).any(axis=-1).mean() < 1e-3
     assert small.any()
-    with pytest.raises(ValueError, match="size=0 must be 1 or more"):
+    with pytest.raises(ValueError, match="size=0 must be 1 to 4,096"):
         render_rgb(*arguments, has_table=True, has_shadows=False, size=0)
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -46,6 +48,17 @@ def heap(seed: int, count: int) -> Arrays:
 def assert_same(found: Any, expected: Any) -> None:
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(np.asarray(one), np.asarray(other))
+
+
+@pytest.mark.property
+def test_copies_simulate_the_same_apart(short: MujocoC) -> None:
+    """A shallow copy shares the worlds; others have theirs, in other processes too."""
+    state = heap(0, 3)
+    expected = short.settle_host(*state)
+    for copied in (copy.deepcopy(short), pickle.loads(pickle.dumps(short))):
+        assert copied._worlds is not short._worlds
+        assert_same(copied.settle_host(*state), expected)
+    assert copy.copy(short)._worlds is short._worlds
 
 
 @pytest.mark.golden
@@ -275,10 +288,14 @@ def test_bad_input_is_refused(short: MujocoC) -> None:
     ids[1, 3] = 810
     with pytest.raises(ValueError, match=r"shape_ids has 810; ids are 0\.\.809"):
         short.settle_host(ids, qpos, qvel)
-    with pytest.raises(ValueError, match="settle_steps=0 must be at least 1"):
+    with pytest.raises(ValueError, match="settle_steps=0 must be 1 to 100,000"):
         MujocoC(settle_steps=0)
     with pytest.raises(ValueError, match="num_threads=-1 must be 0"):
         MujocoC(num_threads=-1)
+    with pytest.raises(ValueError, match="num_threads=1000000 must be 0"):
+        MujocoC(num_threads=10**6)
+    with pytest.raises(ValueError, match="settle_steps=1000000000 must be 1 to"):
+        MujocoC(settle_steps=10**9)
 
 
 @pytest.mark.unit

@@ -242,6 +242,7 @@ def test_shapes_from_a_file(tmp_path: Path) -> None:
     [
         ("cube,1,0,1,1,1\n", f"line 1: the header is 'cube,1,0,1,1,1' and must be '{HEADER}'"),
         ("", f"line 1: the header is '' and must be '{HEADER}'"),
+        (f"{HEADER}\n" + "cube,1,0,1,1,1\n" * 10_001, "has 10,001 shapes; 10,000 are the most"),
         (f"{HEADER}\n", "has no shapes; give one a line, such as cube,0.25,33,"),
         ("cube,0.2,0,1,1\n", "line 3: 'cube,0.2,0,1,1' is not a solid and five numbers, such as"),
         ("cube,big,0,1,1,1\n", "line 3: 'cube,big,0,1,1,1' is not a solid and five numbers"),
