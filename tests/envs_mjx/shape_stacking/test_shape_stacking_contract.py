@@ -17,7 +17,7 @@ pytestmark = pytest.mark.contract
 ENV = ShapeStacking(MujocoC(settle_steps=10, num_threads=1))
 PARAMS = ENV.default_params
 CHANGES = {"max_actions": jnp.int32(4)}
-NUM_ENVS, NUM_STEPS = 4, 21
+NUM_ENVS, NUM_STEPS = 2, 21
 
 
 @pytest.fixture(scope="module")
