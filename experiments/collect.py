@@ -27,6 +27,7 @@ ARGUMENTS.define(
     "validation, test, or a file of ids.",
 )
 ARGUMENTS.define("string", "output", None, "One file (.npz) for the recordings; resumable.")
+ARGUMENTS.define("bool", "overwrite", False, "Replace the file of --output.")
 
 
 def main() -> None:
@@ -40,10 +41,11 @@ def main() -> None:
             representation=ARGUMENTS.representation if ARGUMENTS.is_given("representation") else "",
             num_recordings=ARGUMENTS.recordings,
             budget=ARGUMENTS.budget,
+            overwrite=ARGUMENTS.overwrite,
         )
         describe(made)
         return
-    ARGUMENTS.refuse(["ids", "universe"], "without --output")
+    ARGUMENTS.refuse(["ids", "universe", "overwrite"], "without --output")
     domain = Domain.of(load_task(ARGUMENTS.task))
     play = domain.play
     if ARGUMENTS.is_given("representation"):

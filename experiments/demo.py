@@ -19,6 +19,7 @@ from experiments.reports.paper import paper_value
 from jaxnew.embedding import embed
 from jaxnew.rollout.contract import Policy
 from jaxnew.run import Run
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import load_task
 from jaxnew.training import train
 
@@ -44,9 +45,10 @@ def main() -> int | None:
         return run.interrupted_by
     print_report(encoder)
     print_success(run, task.budget(budget).final_episodes)
-    for file in figures.make_figures([run.path], run.path / "figures"):
+    out = RunDirectory.load(run.path).figures
+    for file in figures.make_figures([run.path], out):
         print(f"  {file}")
-    animate_run(run.path, run.path / "figures" / "zero_shot_episode.gif")
+    animate_run(run.path, out / "zero_shot_episode.gif")
     print(f"{(time.perf_counter() - start) / 60:.1f} minutes. Everything is in {run.path}.")
     return None
 

@@ -15,6 +15,7 @@ from experiments.flags import Arguments
 from jaxnew.embedding import Encoder, embed
 from jaxnew.observations import Recordings
 from jaxnew.recording import REPRESENTATION_SEED
+from jaxnew.storage.files import check_new
 from jaxnew.task.places import UsageError
 
 _OF_TRAINING = (
@@ -24,13 +25,19 @@ _OF_TRAINING = (
 ARGUMENTS = Arguments(__doc__, *_OF_TRAINING)
 ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
 ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
-ARGUMENTS.define("string", "output", None, "Where to write the table of the new actions (.npz).")
+ARGUMENTS.define(
+    "string",
+    "output",
+    None,
+    "Where to write the table of the new actions (.npz); --overwrite replaces it.",
+)
 
 
 def main() -> int | None:
     given = [ARGUMENTS.checkpoint, ARGUMENTS.observations, ARGUMENTS.output]
     if all(given):
-        ARGUMENTS.refuse(_OF_TRAINING, "with --checkpoint")
+        unused = [name for name in _OF_TRAINING if name != "overwrite"]
+        ARGUMENTS.refuse(unused, "with --checkpoint")
         encode_new_actions(*map(Path, given))
     elif any(given):
         raise UsageError(
@@ -59,6 +66,7 @@ def main() -> int | None:
 
 def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None:
     """Representations of recorded actions from a frozen encoder."""
+    check_new(output, ARGUMENTS.overwrite)
     table = Encoder.load(checkpoint).encode(Recordings.load(recordings))
     table.save(output)
     print(f"{output}: {table.vectors.shape[0]} actions, {table.vectors.shape[1]} numbers each.")

@@ -162,7 +162,7 @@ def film_given(paths: Sequence[Path]) -> list[Path]:
     (group,) = group_runs(runs)
     if ARGUMENTS.is_given("task") and load_task(ARGUMENTS.task).reference != group.task.reference:
         raise UsageError(f"{runs[0].path} is a run of {group.task.name}, not of {ARGUMENTS.task}.")
-    out = Path(ARGUMENTS.out) if ARGUMENTS.out else runs[0].path / "figures"
+    out = Path(ARGUMENTS.out) if ARGUMENTS.out else RunDirectory.load(runs[0].path).figures
     title = f"Figure 8, {group.place}: {group.label}"
     return film_run(runs[0].path, out / "figure_8", title, options().films, ARGUMENTS.workers)
 
@@ -172,7 +172,9 @@ def draw_given(paths: Sequence[Path]) -> list[Path]:
     ARGUMENTS.refuse(("task", "workers", *_FILMS, *_PRODUCTION), "without --figure")
     if not ARGUMENTS.out and len(paths) > 1:
         raise UsageError("Several runs: say where their figures go with --out=DIRECTORY.")
-    out = Path(ARGUMENTS.out) if ARGUMENTS.out else Path(*paths[:1]) / "figures"
+    if not paths:
+        raise UsageError("Say which runs: --run=DIRECTORY[,DIRECTORY...].")
+    out = Path(ARGUMENTS.out) if ARGUMENTS.out else RunDirectory.load(paths[0]).figures
     animated = policies(paths)[0].path if ARGUMENTS.episode else None
     files = make_figures(paths, out, ARGUMENTS.pdf)
     if animated is not None:

@@ -16,6 +16,8 @@ from typing import Self
 
 import numpy as np
 
+from jaxnew.storage.files import read_json, write_bytes_atomically
+
 SPLIT_NAMES = ("train", "validation", "test")
 
 
@@ -261,13 +263,14 @@ class ActionSplit:
                     )
 
     def save(self, path: Path) -> None:
+        """Writes `path` (.json), whole or not at all."""
         record = {
             "universe_hash": self.universe_hash,
             "seed": self.seed,
             "hash": self.hash,
             **{name: getattr(self, name).tolist() for name in (*SPLIT_NAMES, "always_available")},
         }
-        path.write_text(json.dumps(record))
+        write_bytes_atomically(path, json.dumps(record).encode())
 
     @classmethod
     def load(cls, path: Path) -> ActionSplit:
@@ -275,13 +278,25 @@ class ActionSplit:
 
         Raises:
           SplitMismatch: the ids do not have the hash recorded beside them.
+          ValueError: the file is missing or damaged.
         """
-        record = json.loads(path.read_text())
-        recorded_hash = record["hash"]
-        id_lists = {
-            name: np.array(record[name], np.int32) for name in (*SPLIT_NAMES, "always_available")
-        }
-        split = cls(universe_hash=record["universe_hash"], seed=record["seed"], **id_lists)
+        try:
+            record = read_json(path, ValueError)
+        except FileNotFoundError as err:
+            raise ValueError(
+                f"{path} is missing: it says which actions are seen in training. Restore it from a "
+                "copy."
+            ) from err
+        try:
+            recorded_hash = record["hash"]
+            id_lists = {
+                name: np.array(record[name], np.int32)
+                for name in (*SPLIT_NAMES, "always_available")
+            }
+            split = cls(universe_hash=record["universe_hash"], seed=record["seed"], **id_lists)
+        except (KeyError, TypeError, ValueError, OverflowError) as err:
+            what = f"it lacks {err}" if isinstance(err, KeyError) else str(err)
+            raise ValueError(f"{path} is damaged ({what}). Restore it from a copy.") from err
         if split.hash != recorded_hash:
             raise SplitMismatch(
                 f"{path} was edited or damaged: its ids hash to {split.hash}, it says "

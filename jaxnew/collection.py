@@ -27,13 +27,22 @@ from jaxnew.observations import (
     row_hash,
 )
 from jaxnew.storage.config import differences
-from jaxnew.storage.files import take_lock, write_json_atomically
+from jaxnew.storage.files import (
+    StorageError,
+    access,
+    megabytes,
+    read_json,
+    remove_temporaries,
+    take_lock,
+    write_json_atomically,
+)
 from jaxnew.storage.progress import ProgressDisplay
 
 KIND = "jaxnew action recordings"
 FORMAT_VERSION = 1
 MANIFEST = "manifest.json"
 DATA = "recordings.npy"
+_MANIFEST_BYTES = 100  # Per action: number and hash, in the manifest and in the one that follows.
 
 RecordBlock = Callable[[int, np.ndarray, int], np.ndarray]
 
@@ -68,6 +77,7 @@ def collect(
     Raises:
       ObservationsError: `path` holds something else or recordings with other settings, the disk is
         too small, or `record_block` broke its promise.
+      StorageError: the system refuses, e.g. because the disk is full. What is recorded is kept.
     """
     path = Path(path)
     ids = checked_ids(ids, universe, "collect")
@@ -76,15 +86,18 @@ def collect(
             f"num_recordings={num_recordings} and block_actions={block_actions} must be at least 1."
         )
     settings = _settings(format, universe, ids, num_recordings, seed, play_settings or {})
-    path.mkdir(parents=True, exist_ok=True)
-    if not (path / MANIFEST).exists() and any(
-        not name.startswith(".") for name in os.listdir(path)
-    ):
+    with access(path, "written"):
+        path.mkdir(parents=True, exist_ok=True)
+        is_foreign = not (path / MANIFEST).exists() and any(
+            not name.startswith(".") for name in os.listdir(path)
+        )
+    if is_foreign:
         raise ObservationsError(
             f"{path} is not empty and has no {MANIFEST}. Choose another directory."
         )
     lock = _wait_for_lock(path)
     try:
+        remove_temporaries(path)
         _Collection(path, format, ids, num_recordings, settings).run(
             record_block, seed, min(block_actions, len(ids))
         )
@@ -199,7 +212,7 @@ class _Collection:
                 ]
                 raise ObservationsError(
                     f"{path} holds recordings with other settings:\n" + "\n".join(lines) + "\n"
-                    "Choose another directory, or delete that one."
+                    "Choose another directory."
                 )
             self._hashes = manifest["action_hashes"]
 
@@ -245,23 +258,26 @@ class _Collection:
                 self._hashes[row] = None
 
     def _create_data(self) -> None:
-        needed = self._format.estimate_bytes(len(self._ids), self._shape[1])
-        free = shutil.disk_usage(self._path).free
-        if needed > free:
-            raise ObservationsError(
-                f"{self._path} needs {needed / 1e6:,.0f} MB, but only {free / 1e6:,.0f} MB are "
-                "free. Record fewer actions or fewer times, or use another disk."
-            )
-        temporary = self._path / f".{DATA}"
-        np.lib.format.open_memmap(temporary, "w+", np.dtype(self._format.dtype), self._shape)
-        os.replace(temporary, self._path / DATA)
+        manifests = _MANIFEST_BYTES * (100 + len(self._ids))
+        needed = self._format.estimate_bytes(len(self._ids), self._shape[1]) + manifests
+        with access(self._path / DATA, "written"):
+            free = shutil.disk_usage(self._path).free
+            if needed > free:
+                raise ObservationsError(
+                    f"{self._path} needs {megabytes(needed)}, {megabytes(manifests)} of it for the "
+                    f"manifest, but only {megabytes(free)} are free. Record fewer actions or fewer "
+                    "times, make room, or use another disk."
+                )
+            temporary = self._path / f".{DATA}"
+            np.lib.format.open_memmap(temporary, "w+", np.dtype(self._format.dtype), self._shape)
+            os.replace(temporary, self._path / DATA)
 
     def _store(self, rows: np.ndarray, recorded: np.ndarray) -> None:
         """Writes rows to disk, and only then says in the manifest that they are there."""
         data = open_data(self._path, self._format, self._shape)
         row_bytes = data.nbytes // len(data)
         # Plain writes: a full disk is an error here, but kills a process that writes to a map.
-        with (self._path / DATA).open("r+b") as file:
+        with access(self._path / DATA, "written"), (self._path / DATA).open("r+b") as file:
             for row, recording in zip(rows.tolist(), recorded, strict=True):
                 file.seek(data.offset + row * row_bytes)
                 file.write(np.ascontiguousarray(recording).tobytes())
@@ -290,7 +306,7 @@ def manifest_hash(manifest: dict[str, Any]) -> str:
 def read_manifest(path: Path) -> dict[str, Any]:
     """The manifest of the recording directory `path`, checked to be whole and of this format."""
     try:
-        manifest = json.loads((path / MANIFEST).read_text(encoding="utf-8"))
+        manifest = read_json(path / MANIFEST, ObservationsError)
         kind, version = manifest["kind"], manifest["format_version"]
         if kind != KIND or version != FORMAT_VERSION:
             raise ObservationsError(
@@ -304,10 +320,10 @@ def read_manifest(path: Path) -> dict[str, Any]:
         raise ObservationsError(
             f"{path} has no {MANIFEST}: there are no recordings. Run collect first."
         ) from err
-    except (json.JSONDecodeError, UnicodeDecodeError, KeyError, TypeError, AttributeError) as err:
+    except KeyError as err:
         raise ObservationsError(
-            f"{path / MANIFEST} is damaged ({err!r}). Restore it from a copy, or delete the "
-            "directory and collect again."
+            f"{path / MANIFEST} is damaged ({err!r}). Restore it from a copy, or move the "
+            "directory away and collect again."
         ) from err
     return dict(manifest)
 
@@ -315,8 +331,12 @@ def read_manifest(path: Path) -> dict[str, Any]:
 def open_data(path: Path, format: RecordingFormat, shape: tuple[int, ...]) -> np.memmap:
     """The memory-mapped recordings, read-only, with the right shape and dtype."""
     try:
+        with access(path / DATA):
+            (path / DATA).open("rb").close()
         data = np.load(path / DATA, mmap_mode="r", allow_pickle=False)
-    except (OSError, ValueError, EOFError) as err:
+    except (FileNotFoundError, ValueError, EOFError) as err:
+        if isinstance(err, StorageError):
+            raise
         raise ObservationsError(
             f"{path / DATA} is missing or damaged ({err}). Run collect again to repair it."
         ) from err

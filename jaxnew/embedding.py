@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -74,11 +75,8 @@ class Encoder:
         if "model" not in directory.config:
             raise ConfigError(f"{path} is no run of an encoder: its config has no model.")
         config = from_dict(EmbedConfig, upgraded(directory.config))
-        file = directory.path / TABLE_FILE
-        table = RepresentationTable.load(file) if file.exists() else None
-        made = [s["table_hash"] for s in directory.provenance["sessions"] if "table_hash" in s]
-        if table is not None and made:
-            check_same("table", table.hash, made[-1], path)
+        is_made = (directory.path / TABLE_FILE).exists()
+        table = load_table(directory.path) if is_made else None
         return cls(directory.path, config, task or load_task(config.task), _table=table)
 
     @property
@@ -333,8 +331,29 @@ def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:
 def is_learned(representation: str) -> bool:
     """Whether a representation is the name of one that is learned, not of a file or a run."""
     path = Path(representation)
-    is_place = path.is_dir() or path.suffix == ".npz"
+    is_place = os.path.isdir(path) or path.suffix == ".npz"
     return representation.startswith(("hvae", "vae")) and not is_place
+
+
+def load_table(path: Path) -> RepresentationTable:
+    """A table from its file, or from a run directory, where it has to be the one on record.
+
+    Raises:
+      UsageError: the run has none, because it was interrupted.
+      RunDirectoryError: it is no run directory.
+      SplitMismatch: the table of the run was exchanged for another.
+      ValueError: the file is missing or damaged.
+    """
+    if not os.path.isdir(path):
+        return RepresentationTable.load(path)
+    sessions = RunDirectory.load(path).provenance["sessions"]
+    if not (path / TABLE_FILE).exists():
+        raise UsageError(f"{path} has no {TABLE_FILE}: it was interrupted; embed again to go on.")
+    table = RepresentationTable.load(path / TABLE_FILE)
+    made = [session["table_hash"] for session in sessions if "table_hash" in session]
+    if made:
+        check_same("table", table.hash, made[-1], path)
+    return table
 
 
 def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> RepresentationTable:
@@ -356,8 +375,8 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
         table = engineered_table(domain.universe, representation)
     elif match := re.fullmatch(r"random-(\d+)", representation):
         table = random_table(domain.universe, int(match[1]), REPRESENTATION_SEED)
-    elif path.is_dir() or path.suffix == ".npz":
-        table = RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
+    elif os.path.isdir(path) or path.suffix == ".npz":
+        table = load_table(path)
     else:
         table = embed(
             domain.task,

@@ -3,7 +3,8 @@
 Both stages and fine-tuning use it. Killing the process at any instant and running again gives the
 same states and the same metrics as one undisturbed run (bit for bit where the chunk is
 deterministic), because a `latest` checkpoint at step s is written after everything that belongs to
-steps <= s, and a resumed run removes everything that belongs to later ones.
+steps <= s, and a resumed run removes everything that belongs to later ones. Only a run that never
+had a `latest` checkpoint is begun anew; one that has lost it is refused and left as it is.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ import math
 import os
 import signal
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -23,8 +25,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnew.storage.checkpoint import Checkpointer, Kind
-from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog
+from jaxnew.storage.checkpoint import KINDS, Checkpointer, CheckpointError, Kind
+from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog, read
 from jaxnew.storage.progress import ProgressDisplay, duration
 from jaxnew.storage.run_directory import RunDirectory
 
@@ -143,7 +145,9 @@ def run(
     Raises:
       NonFiniteError: a metric that may not be NaN is not finite, a `nonfinite/*` count is above
         zero, or `params` are not finite. The checkpoints hold earlier, good states.
-      CheckpointError: there are checkpoints but none that is readable and fits the state.
+      CheckpointError: there are checkpoints but none that is readable and fits the state, or the
+        `latest` ones were lost.
+      MetricsError: `metrics.jsonl` is not what it was when the checkpoint was saved.
       ValueError: arguments do not fit together, or the evaluation lacks the selection metric.
     """
     total_steps, title = rhythm.total_steps, display.title
@@ -157,8 +161,7 @@ def run(
         )
     session: _Session[State] = _Session(
         state,
-        Checkpointer(run_directory.checkpoints),
-        MetricsLog(run_directory.path),
+        run_directory,
         may_be_nan=tuple(may_be_nan),
         selection_metric=selection_metric,
     )
@@ -200,6 +203,8 @@ def run(
                 is_due = session.evaluate(evaluate) or is_due
             if is_due:
                 session.save_latest()
+        if session.lacks_best and evaluate is not None and session.step == total_steps:
+            session.evaluate(evaluate, is_recorded=False)
         session.save_latest()
         if received:
             progress.say(f"{title}: stopped at step {session.step}; run again to go on.")
@@ -275,14 +280,14 @@ class _Session(Generic[State]):
     def __init__(
         self,
         state: State,
-        checkpointer: Checkpointer,
-        log: MetricsLog,
+        run_directory: RunDirectory,
         *,
         may_be_nan: tuple[str, ...],
         selection_metric: str | None,
     ) -> None:
-        self.log = log
-        self._checkpointer = checkpointer
+        self._directory = run_directory
+        self.log = log = MetricsLog(run_directory.path)
+        self._checkpointer = checkpointer = Checkpointer(run_directory.checkpoints)
         self._may_be_nan, self._selection_metric = may_be_nan, selection_metric
         self.last_evaluation: dict[str, float] | None = None
         self.best_metric: float | None = None
@@ -294,15 +299,50 @@ class _Session(Generic[State]):
         self._num_chunks = 0
         if self.was_resumed:
             state, metadata = checkpointer.restore("latest", state)
-            self.best_metric, self.best_step = metadata["best_metric"], metadata["best_step"]
             self._elapsed_s = metadata["elapsed_s"]
+            read(run_directory.path, metadata.get("metrics"))
+            run_directory.note_saved()
+        else:
+            self._check_is_new()
         self.state = state
         self.step = _step_of(state)
         self._saved_step = self.step if self.was_resumed else None
         # Whatever was recorded after the checkpoint is made again, identically.
         checkpointer.discard_after(self.step if self.was_resumed else -1)
         log.cut_back(self.step if self.was_resumed else -1)
+        for kind in KINDS:
+            checkpointer.clean(kind)
+        self.lacks_best = False
+        if self.was_resumed and metadata["best_step"] is not None:
+            self._find_best(metadata["best_step"])
         self.start_clock()
+
+    def _check_is_new(self) -> None:
+        """Raises CheckpointError if the run has lost its `latest` checkpoint."""
+        found = self._checkpointer.steps("best"), self.log.mark["lines"]
+        if any(found) and self._directory.has_been_saved:
+            raise CheckpointError(
+                f"{self._checkpointer.directory / 'latest'} is lost: the run was saved before, and "
+                f"still has {found[1]} reports and {len(found[0])} `best` checkpoints, which are "
+                "left as they are. Restore `latest` from a copy, use what is there with evaluate, "
+                "or start anew with --overwrite, which deletes all of it."
+            )
+
+    def _find_best(self, recorded: int) -> None:
+        """The best checkpoint that is whole; without the recorded one, a new one is looked for."""
+        self._checkpointer.set_aside_damaged("best", self.state)
+        steps = self._checkpointer.steps("best")
+        if steps:
+            metadata = self._checkpointer.metadata("best")
+            self.best_metric, self.best_step = metadata["best_metric"], metadata["best_step"]
+        self.lacks_best = self.best_step is None or self.best_step < recorded
+        if self.lacks_best:
+            warnings.warn(
+                f"The `best` checkpoint of step {recorded} in {self._checkpointer.directory} is "
+                f"lost; now it is that of step {self.best_step}, until an evaluation is better: "
+                "the next one of training, or that of the state at its end.",
+                stacklevel=2,
+            )
 
     def start_clock(self) -> None:
         self._clock = time.monotonic()
@@ -364,7 +404,7 @@ class _Session(Generic[State]):
         self.log.write(self.step, {**metrics, **timed})
         return f"{duration(self._elapsed_s)}  {text}"
 
-    def evaluate(self, evaluate: Callable[[State], Scalars]) -> bool:
+    def evaluate(self, evaluate: Callable[[State], Scalars], is_recorded: bool = True) -> bool:
         """Evaluates and records; saves a new best state and says whether there was one."""
         found = _floats(evaluate(self.state))
         self.last_evaluation = found
@@ -377,7 +417,8 @@ class _Session(Generic[State]):
         lap = {TIME_PREFIX + "evaluation_s": self._lap()}
         if selected is not None and not math.isfinite(found[selected]):
             self._stop(f"{selected} is {found[selected]}", found)
-        self.log.write(self.step, {**found, **lap})
+        if is_recorded:
+            self.log.write(self.step, {**found, **lap})
         if selected is None or (
             self.best_metric is not None and found[selected] <= self.best_metric
         ):
@@ -396,6 +437,7 @@ class _Session(Generic[State]):
         if self._saved_step != self.step:
             self._save("latest")
             self._saved_step, self._saved_at = self.step, time.monotonic()
+            self._directory.note_saved()
 
     def _save(self, kind: Kind) -> None:
         for path, leaf in jax.tree_util.tree_leaves_with_path(getattr(self.state, "params", ())):
@@ -409,6 +451,7 @@ class _Session(Generic[State]):
             "best_metric": self.best_metric,
             "best_step": self.best_step,
             "elapsed_s": self._elapsed_s,
+            "metrics": self.log.mark,
         }
         self._checkpointer.save(kind, self.step, self.state, metadata)
 

@@ -11,7 +11,8 @@ from typing import Any
 import numpy as np
 
 from jaxnew.actions import ActionIdentity, ActionUniverse, content_hash
-from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
+from jaxnew.storage.arrays import read_arrays
+from jaxnew.storage.files import write_bytes_atomically
 
 UNKNOWN_MODALITY = "unknown"
 
@@ -175,7 +176,7 @@ class Recordings:
           ObservationsError: the file is missing, damaged or was edited, or its arrays do not belong
             together.
         """
-        arrays = _read_npz(Path(path))
+        arrays = read_arrays(Path(path), ("ids", "recordings"), ObservationsError)
         ids, data = checked_ids(arrays["ids"], None, str(path)), arrays["recordings"]
         if data.ndim < 2 or data.shape[0] != len(ids) or 0 in data.shape:
             raise ObservationsError(
@@ -228,19 +229,3 @@ def row_hash(rows: np.ndarray) -> str:
 def action_rng(seed: int, action_id: int) -> np.random.Generator:
     """Random numbers for recording one action, the same whatever else is recorded beside it."""
     return np.random.default_rng(np.random.SeedSequence([seed, action_id]))
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file that has at least `ids` and `recordings`."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except UNREADABLE_NPZ as err:
-        raise ObservationsError(
-            f"{path} is missing or damaged ({err}); it must be an .npz file with the arrays `ids` "
-            "and `recordings`."
-        ) from err
-    for name in ("ids", "recordings"):
-        if name not in arrays:
-            raise ObservationsError(f"{path} lacks the array {name!r}; it has {sorted(arrays)}.")
-    return arrays

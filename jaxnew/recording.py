@@ -19,6 +19,7 @@ from jaxnew.actions import SPLIT_NAMES, ActionIdentity, ActionUniverse, load_ids
 from jaxnew.observations import RecordingFormat, Recordings
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
+from jaxnew.storage.files import check_new
 from jaxnew.task.budgets import StageOneBudget
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
@@ -152,6 +153,7 @@ def record(
     num_recordings: int | None = None,
     budget: str = "laptop",
     seed: int = REPRESENTATION_SEED,
+    overwrite: bool = False,
 ) -> Recordings:
     """Records actions into one file, which an encoder reads (paper algorithm 2, first step).
 
@@ -167,12 +169,14 @@ def record(
       num_recordings: S, per action; default: as the budget's encoders have.
       budget: a preset of stage one.
       seed: of the recordings.
+      overwrite: replace the file if there is one.
 
     Returns:
       What encoders read: drawn recordings, where recordings are drawn.
 
     Raises:
       UsageError, ValueError: there are no such actions, universe, representation or budget.
+      StorageError: the file exists, or its place cannot be written.
       ObservationsError: see `jaxnew.collection.collect`.
     """
     own = load_task(task) if isinstance(task, str) else task
@@ -180,6 +184,7 @@ def record(
     chosen = _chosen(domain, ids, own)
     play = parse_representation(domain, representation).play if representation else domain.play
     partial = output.with_name(f".{output.name}.unfinished")
+    check_new(output, overwrite or partial.exists())  # A call that was killed goes on.
     count = num_recordings or domain.stage_one(play, budget).num_recordings
     recorded = _recorded(partial / play.folder, domain, play, chosen, count, seed)
     if play.drawing is not None:

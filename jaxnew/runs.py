@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -54,10 +53,12 @@ class Runs:
         directory = RunDirectory.load(path)
         if not is_sweep(directory):
             raise UsageError(f"{path} is no sweep; give the directory of a run of sweep.")
-        file = directory.path / "evaluation" / f"{MEMBERS}.json"
-        if not file.exists():
-            raise UsageError(f"The sweep {path} has written no members yet; run it to its end.")
-        recorded = json.loads(file.read_text(encoding="utf-8"))[MEMBERS]
+        try:
+            recorded = directory.evaluation(MEMBERS)[MEMBERS]
+        except FileNotFoundError as err:
+            raise UsageError(
+                f"The sweep {path} has written no members yet; run it to its end."
+            ) from err
         task = task or load_task(directory.config[MEMBERS][0]["task"])
         rows = tuple(_row(entry, directory.path / MEMBERS) for entry in recorded)
         return cls(directory.path, rows, task)
@@ -80,11 +81,11 @@ class Runs:
         return [{**row, **self._evaluated(Path(row["path"]))} for row in self.rows]
 
     def _evaluated(self, path: Path) -> dict[str, float]:
-        files = {file.stem: json.loads(file.read_text()) for file in path.glob("evaluation/*.json")}
+        files = RunDirectory.load(path).evaluations()
         metric = self.task.selection_metric
         return {
             name: files[name]["metrics"][metric]["mean"]
-            for name in sorted(files)
+            for name in files
             if metric in files[name].get("metrics", {})
         }
 

@@ -369,11 +369,12 @@ def write_members(directory: RunDirectory, program: SweepProgram, state: SweepSt
         if not members.exists():
             trainer = replace(program.trainer, config=config)
             with open_run(partial / name, trainer, overwrite=True) as member:
-                write_metrics(member, lines, f"{index:03d}/")
-                checkpointer = Checkpointer(member.checkpoints)
+                mark = write_metrics(member, lines, f"{index:03d}/")
+                checkpointer, kept = Checkpointer(member.checkpoints), {**metadata, "metrics": mark}
                 if has_best:
-                    checkpointer.save("best", int(best.step), best, metadata)
-                checkpointer.save("latest", config.num_updates, latest, metadata)
+                    checkpointer.save("best", int(best.step), best, kept)
+                checkpointer.save("latest", config.num_updates, latest, kept)
+                member.note_saved()
         numbers = plain(config.hyperparameters)
         rows.append({"path": str(path), "seed": config.seed, **metadata, **numbers})
     if not members.exists():
@@ -381,8 +382,8 @@ def write_members(directory: RunDirectory, program: SweepProgram, state: SweepSt
     directory.record_evaluation(MEMBERS, {MEMBERS: rows})
 
 
-def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str) -> None:
-    """The lines of one member, under the names that `train` gives them."""
+def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str) -> dict[str, Any]:
+    """The lines of one member, under the names that `train` gives them; returns their mark."""
     with MetricsLog(member.path) as log:
         for line in lines:
             values = {
@@ -392,3 +393,4 @@ def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str
             }
             if values:
                 log.write(line["step"], values)
+        return log.mark

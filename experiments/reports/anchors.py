@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 from experiments.reports.plots import Metric
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.storage import config as config_lib
+from jaxnew.storage.files import read_json, write_json_atomically
 from jaxnew.task.domain import Domain
 from jaxnew.task.places import UsageError
 from jaxnew.task.task import Task
@@ -87,7 +87,7 @@ class Anchors:
         """Writes them into a folder, in place of those that are like them."""
         folder.mkdir(parents=True, exist_ok=True)
         path = self.path(folder)
-        path.write_text(json.dumps(asdict(self), indent=2) + "\n", encoding="utf-8")
+        write_json_atomically(path, asdict(self))
         return path
 
     @classmethod
@@ -98,10 +98,10 @@ class Anchors:
           UsageError: the file holds something else.
         """
         try:
-            return cls(**json.loads(path.read_text(encoding="utf-8")))
-        except (TypeError, ValueError) as err:
+            return cls(**read_json(path, UsageError))
+        except TypeError as err:
             raise UsageError(
-                f"{path} is damaged ({err}); delete it, and make it anew with experiments.anchors."
+                f"{path} is damaged ({err}). Restore it from a copy, or make it anew with anchors."
             ) from err
 
     def heading(self, metrics: Sequence[str]) -> list[str]:

@@ -6,6 +6,7 @@ Figures are made through matplotlib's objects, without pyplot, so that nothing g
 from __future__ import annotations
 
 import colorsys
+import io
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -18,6 +19,8 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
+
+from jaxnew.storage.files import write_bytes_atomically
 
 Color = tuple[float, float, float]
 
@@ -229,7 +232,8 @@ def _draw_bar(
     """A bar with its error and its number; `end` is that of the axis."""
     is_test = split == "test"
     height = metric.scale * bar.mean
-    errors = [[metric.scale * (bar.mean - bar.low)], [metric.scale * (bar.high - bar.mean)]]
+    sides = bar.mean - bar.low, bar.high - bar.mean
+    errors = [[metric.scale * max(side, 0.0)] for side in sides]  # -1e-17 is an error bar's end.
     axes.bar(
         x,
         height,
@@ -325,12 +329,14 @@ def _legend_entry(names: Sequence[str]) -> float:
 def save(figure: Figure, path: Path, pdf: bool = False) -> list[Path]:
     """Writes `path` (PNG) and, if asked for, the same name with `.pdf`; returns what it wrote."""
     path.parent.mkdir(parents=True, exist_ok=True)
-    figure.savefig(path, dpi=200, facecolor="white")
-    written = [path]
+    options: dict[Path, dict[str, Any]] = {path: {"dpi": 200, "facecolor": "white"}}
     if pdf:
-        written.append(path.with_suffix(".pdf"))
-        figure.savefig(written[-1], metadata={"CreationDate": None})
-    return written
+        options[path.with_suffix(".pdf")] = {"metadata": {"CreationDate": None}}
+    for file, how in options.items():
+        content = io.BytesIO()
+        figure.savefig(content, format=file.suffix[1:], **how)
+        write_bytes_atomically(file, content.getvalue())
+    return list(options)
 
 
 def new_figure(width: float, height: float) -> Figure:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from experiments.reports.runs import RunRecord, read_runs
-from jaxnew.embedding import TABLE_FILE
+from jaxnew.embedding import load_table
 from jaxnew.recording import REPRESENTATION_SEED
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage.config import ConfigError
@@ -144,7 +144,7 @@ class Source:
         path = self.given.get(representation)
         if path is None:
             return None
-        return RepresentationTable.load(path / TABLE_FILE if path.is_dir() else path)
+        return load_table(path)
 
     def embed_folder(self, representation: str) -> Path:
         """Where `embed` keeps a representation."""

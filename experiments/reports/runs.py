@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import pairwise
@@ -26,9 +26,10 @@ from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Question
 from jaxnew.runs import is_sweep
+from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import differences, plain
 from jaxnew.storage.metrics import read
-from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.storage.run_directory import RunDirectory, RunDirectoryError
 from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import upgraded
@@ -56,18 +57,28 @@ class RunRecord:
 
     @cached_property
     def reports(self) -> list[dict[str, Any]]:
-        """The lines of `metrics.jsonl`."""
-        return read(self.path)
+        """The lines of `metrics.jsonl`.
+
+        Raises:
+          MetricsError: they are not those that were written.
+        """
+        checkpointer = Checkpointer(self.path / "checkpoints")
+        has_latest = bool(checkpointer.steps("latest"))
+        mark = checkpointer.metadata("latest").get("metrics") if has_latest else None
+        return read(self.path, mark)
 
     @cached_property
     def evaluations(self) -> list[dict[str, Any]]:
         """What `Run.evaluate` recorded.
 
         Raises:
-          UsageError: a file is damaged.
+          RunDirectoryError: a file is damaged.
         """
-        found = [_read_evaluation(file) for file in sorted(self.path.glob("evaluation/*.json"))]
-        return [e for e in found if "actions" in e and "metrics" in e]
+        found = RunDirectory.load(self.path).evaluations()
+        played = {name: e for name, e in found.items() if "actions" in e and "metrics" in e}
+        for name, evaluation in played.items():
+            _check_intervals(self.path / "evaluation" / f"{name}.json", evaluation["metrics"])
+        return list(played.values())
 
     @cached_property
     def table(self) -> RepresentationTable | None:
@@ -248,11 +259,16 @@ def _read_run(path: Path) -> RunRecord:
     return RunRecord(path, upgraded(config))
 
 
-def _read_evaluation(file: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except ValueError as err:
-        raise UsageError(f"{file} is damaged ({err}); delete it and evaluate again.") from err
+def _check_intervals(file: Path, metrics: Mapping[str, Mapping[str, Any]]) -> None:
+    """Raises unless every mean lies in its interval, but for what rounding does."""
+    for name, value in metrics.items():
+        low, mean, high = (float(value.get(key, np.nan)) for key in ("low", "mean", "high"))
+        slack = 1e-6 * (1.0 + abs(mean))
+        if not low - slack <= mean <= high + slack:
+            raise RunDirectoryError(
+                f"{file} is damaged: the mean of {name}, {mean:g}, is not in its interval "
+                f"[{low:g}, {high:g}]. Restore it from a copy, or move it away and evaluate again."
+            )
 
 
 def policies(paths: Sequence[Path]) -> list[RunRecord]:

@@ -11,6 +11,7 @@ from experiments.reports import plots, tables
 from experiments.reports.plots import Metric
 from experiments.reports.study_report import Study, StudyPoint, study_figure
 from jaxnew.runs import Runs
+from jaxnew.storage.run_directory import RunDirectory
 
 
 def show_sweep(runs: Runs, out: Path | None = None, stem: str = "sweep") -> list[Path]:
@@ -23,7 +24,8 @@ def show_sweep(runs: Runs, out: Path | None = None, stem: str = "sweep") -> list
     """
     text = as_markdown(runs)
     print(text)
-    return tables.write(out or runs.path / "figures", stem, text, tables.csv_text(runs.summary()))
+    out = out or RunDirectory.load(runs.path).figures
+    return tables.write(out, stem, text, tables.csv_text(runs.summary()))
 
 
 def as_markdown(runs: Runs) -> str:

@@ -8,6 +8,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from jaxnew.storage.files import write_bytes_atomically
+
 
 def csv_text(rows: Sequence[Mapping[str, Any]], titles: Sequence[str] = ()) -> str:
     """One line per row under the names of its fields; what is None stays empty.
@@ -38,5 +40,5 @@ def write(out: Path, stem: str, markdown: str, rows: str) -> list[Path]:
     out.mkdir(parents=True, exist_ok=True)
     files = {out / f"{stem}.md": markdown, out / f"{stem}.csv": rows}
     for path, text in files.items():
-        path.write_text(text, encoding="utf-8")
+        write_bytes_atomically(path, text.encode())
     return list(files)

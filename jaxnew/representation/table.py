@@ -16,7 +16,8 @@ from jaxnew.actions import (
     SplitMismatch,
     content_hash,
 )
-from jaxnew.storage.files import UNREADABLE_NPZ, write_bytes_atomically
+from jaxnew.storage.arrays import read_arrays
+from jaxnew.storage.files import write_bytes_atomically
 
 _TEXTS = ("universe_hash", "split_hash", "source", "play", "encoder_hash", "hash")
 
@@ -136,7 +137,7 @@ class RepresentationTable:
         Raises:
           ValueError: the file is missing or damaged, or its arrays are wrong.
         """
-        arrays = _read_npz(Path(path))
+        arrays = read_arrays(Path(path), ("ids", "vectors"), ValueError)
         texts = {name: str(arrays[name]) for name in _TEXTS if name in arrays}
         try:
             table = cls(
@@ -197,22 +198,6 @@ def random_table(universe: ActionUniverse, size: int, seed: int) -> Representati
         source=f"random:{size}, seed {seed}",
         identity=ActionIdentity.of(universe, ids),
     )
-
-
-def _read_npz(path: Path) -> dict[str, np.ndarray]:
-    """The arrays of a file that has at least `ids` and `vectors`."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except UNREADABLE_NPZ as err:
-        raise ValueError(
-            f"{path} is missing or damaged ({err}); it must be an .npz file with the arrays `ids` "
-            "and `vectors`."
-        ) from err
-    for name in ("ids", "vectors"):
-        if name not in arrays:
-            raise ValueError(f"{path} lacks the array {name!r}; it has {sorted(arrays)}.")
-    return arrays
 
 
 def _checked_vectors(vectors: np.ndarray) -> np.ndarray:

@@ -2,18 +2,24 @@
 
 A checkpoint holds the leaves of a state (any pytree), a description of each leaf with its hash,
 and a plain dictionary. It appears in one rename, so whatever kills the process leaves earlier
-ones readable; a damaged one is recognised by its hashes.
+ones readable; a damaged one is recognised by its hashes. What the system refuses (no permission,
+no space) is a `StorageError`, not damage.
 """
 
 from __future__ import annotations
 
+import contextlib
+import errno
 import hashlib
 import json
+import logging
 import os
+import re
 import shutil
+import sys
 import uuid
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, Literal, TypeVar, cast
 
@@ -22,13 +28,19 @@ import jax.numpy as jnp
 import numpy as np
 import orbax.checkpoint as ocp
 
-from jaxnew.storage.files import sync_folder
+from jaxnew.storage.files import StorageError, access, check_name, check_no_link, sync_folder
 
 State = TypeVar("State")
 Leaf = dict[str, Any]  # Path, shape, dtype and hash of a leaf, as plain JSON.
 Kind = Literal["latest", "best"]
 KINDS: tuple[Kind, ...] = ("latest", "best")
 _KEEP = {"latest": 2, "best": 3}
+_LEFT = ("new-", "old-")  # Of processes that were killed.
+_TO_DO = {
+    "latest": "Restore it from a copy; or start the run anew, which deletes it, with --overwrite.",
+    "best": "Restore it from a copy; or run the command that trained it again: it goes on from the "
+    "`latest` checkpoint and makes a new `best`.",
+}
 _FORMAT_VERSION = 1
 
 
@@ -45,6 +57,44 @@ class _DamagedError(Exception):
     """One checkpoint cannot be read; another may do."""
 
 
+def _system_error(err: BaseException | None) -> OSError | None:
+    """What the system refused, if that is at the root of an error of Orbax or TensorStore."""
+    while err is not None:
+        told = re.search(r"os_error_code='(\d+)'", str(err))
+        number = int(told[1]) if told else err.errno if isinstance(err, OSError) else None
+        if number:
+            return OSError(number, os.strerror(number))
+        err = err.__cause__ or err.__context__
+    return None
+
+
+def _failed(path: Path, err: Exception) -> Exception:
+    """What to raise where a checkpoint could not be read."""
+    refused = _system_error(err)
+    is_missing = (errno.ENOENT, errno.ENOTDIR, errno.EISDIR, errno.EINVAL)
+    if refused is not None and refused.errno not in is_missing:
+        return StorageError.of(path, "read", refused)
+    return _DamagedError(f"{type(err).__name__}: {str(err)[:200]}")
+
+
+@contextlib.contextmanager
+def _raised_once() -> Iterator[None]:
+    """What Orbax's threads print about an error that is raised here as well is left out."""
+    logger, hook = logging.getLogger("absl"), sys.unraisablehook
+
+    def without_loops(unraisable: Any) -> None:
+        if str(unraisable.exc_value) != "Event loop is closed":
+            hook(unraisable)
+
+    was_disabled, logger.disabled = logger.disabled, True
+    sys.unraisablehook = without_loops
+    try:
+        yield
+        sys.unraisablehook = hook  # After an error the threads go on for a while.
+    finally:
+        logger.disabled = was_disabled
+
+
 class Checkpointer:
     """Saves and restores the checkpoints of one run, in `directory/KIND/STEP`.
 
@@ -54,6 +104,7 @@ class Checkpointer:
 
     def __init__(self, directory: Path | str) -> None:
         self._directory = Path(directory).absolute()
+        check_name(self._directory)
         self._orbax = ocp.Checkpointer(ocp.CompositeCheckpointHandler())
 
     @property
@@ -63,7 +114,8 @@ class Checkpointer:
     def steps(self, kind: Kind) -> list[int]:
         """Steps of the committed checkpoints of a kind, ascending."""
         folder = self._folder(kind)
-        names = os.listdir(folder) if folder.is_dir() else []
+        with access(folder):
+            names = os.listdir(folder) if folder.is_dir() else []
         return sorted(int(name) for name in names if name.isdecimal())
 
     def save(
@@ -80,6 +132,7 @@ class Checkpointer:
         Raises:
           ValueError: `step` is not larger, or `metadata` is not plain JSON.
           TypeError: a leaf cannot be stored.
+          StorageError: the system refuses, e.g. because the disk is full; earlier ones are whole.
         """
         folder, existing = self._folder(kind), self.steps(kind)
         if step < 0 or (existing and step <= existing[-1]):
@@ -96,16 +149,26 @@ class Checkpointer:
             "metadata": json.loads(json.dumps(metadata or {}, allow_nan=False)),
         }
         record["hash"] = record_hash(record)
-        self._clean(folder)
         temporary = folder / f"new-{uuid.uuid4().hex}"
         items: dict[str, Any] = {"record": ocp.args.JsonSave(record)}
         # Orbax refuses empty arrays; the description alone restores those.
         filled = {str(i): value for i, (_, value) in enumerate(leaves) if value.size}
         if filled:
             items["state"] = ocp.args.PyTreeSave(filled)
-        self._orbax.save(temporary, ocp.args.Composite(**items))
-        os.rename(temporary, self._path(kind, step))
-        sync_folder(folder)
+        with access(folder, "written"):
+            self.clean(kind)
+            folder.mkdir(parents=True, exist_ok=True)
+            try:
+                with _raised_once():
+                    self._orbax.save(temporary, ocp.args.Composite(**items))
+            except Exception as err:
+                self.clean(kind)
+                refused = _system_error(err)
+                if refused is None:
+                    raise
+                raise StorageError.of(self._path(kind, step), "written", refused) from err
+            os.rename(temporary, self._path(kind, step))
+            sync_folder(folder)
         for old in existing[: 1 - _KEEP[kind]]:
             self._discard(kind, old)
         return self._path(kind, step)
@@ -127,6 +190,7 @@ class Checkpointer:
 
         Raises:
           CheckpointError: none is readable, or the newest holds another structure.
+          StorageError: the system refuses to read it.
         """
         found = self._newest(kind, step, lambda path: self._read(path, example, is_part))
         return cast(tuple[State, dict[str, Any]], found)
@@ -149,6 +213,32 @@ class Checkpointer:
                 if later > step:
                     self._discard(kind, later)
 
+    def set_aside_damaged(self, kind: Kind, example: Any) -> None:
+        """Renames damaged checkpoints that are newer than every whole one, to `damaged-...`.
+
+        Their steps can be saved again; nothing is deleted.
+
+        Args:
+          example: see `restore`.
+        """
+        for step in reversed(self.steps(kind)):
+            path = self._path(kind, step)
+            try:
+                self._read(path, example, False)
+            except _DamagedError as err:
+                aside = path.with_name(f"damaged-{path.name}-{uuid.uuid4().hex[:8]}")
+                os.rename(path, aside)
+                warnings.warn(f"{path} is damaged ({err}); it is {aside.name} now.", stacklevel=2)
+            else:
+                return
+
+    def clean(self, kind: Kind) -> None:
+        """Removes what a killed process left half-written or half-deleted."""
+        folder = check_no_link(self._folder(kind))
+        for name in os.listdir(folder) if folder.is_dir() else []:
+            if name.startswith(_LEFT):
+                shutil.rmtree(folder / name, ignore_errors=True)
+
     def _newest(self, kind: Kind, step: int | None, read: Any) -> Any:
         steps = self.steps(kind) if step is None else [step]
         failures = []
@@ -163,25 +253,23 @@ class Checkpointer:
                 warnings.warn(f"{'; '.join(failures)}; using step {candidate}.", stacklevel=3)
             return found
         if failures:
-            raise CheckpointError(
-                f"No readable checkpoint: {'; '.join(failures)}. Restore it from a copy, or delete "
-                f"{self._folder(kind)} to start this run anew."
-            )
+            raise CheckpointError(f"No readable checkpoint: {'; '.join(failures)}. {_TO_DO[kind]}")
         raise CheckpointError(
             f"There is no {kind} checkpoint in {self._directory}. Train the run first, or give the "
-            "--workdir of another."
+            f"--workdir of another. If there was one: {_TO_DO[kind]}"
         )
 
     def _read_record(self, path: Path) -> dict[str, Any]:
-        if not path.is_dir():
-            raise _DamagedError("it does not exist")
+        with access(path):
+            if not path.is_dir():
+                raise _DamagedError("it does not exist")
         try:
             args = ocp.args.Composite(record=ocp.args.JsonRestore())
             record = self._orbax.restore(path, args).record
             if record.pop("hash") != record_hash(record):
                 raise ValueError("its record is not what was saved")
         except Exception as err:  # Orbax and TensorStore raise many types for damaged files.
-            raise _DamagedError(f"{type(err).__name__}: {str(err)[:200]}") from err
+            raise _failed(path, err) from err
         if record["format_version"] != _FORMAT_VERSION:
             raise CheckpointError(
                 f"{path} has format {record['format_version']}; this program reads "
@@ -216,7 +304,7 @@ class Checkpointer:
                 restore = ocp.args.PyTreeRestore(item=target, restore_args=kinds)
                 found = self._orbax.restore(path, ocp.args.Composite(state=restore)).state
             except Exception as err:  # As above.
-                raise _DamagedError(f"{type(err).__name__}: {str(err)[:200]}") from err
+                raise _failed(path, err) from err
             for name, value in found.items():
                 values[int(name)] = np.asarray(value)
         for leaf, value in zip(saved, values, strict=True):
@@ -236,17 +324,11 @@ class Checkpointer:
 
     def _discard(self, kind: Kind, step: int) -> None:
         """Deletes one checkpoint; it is gone at once even if deleting its files is cut short."""
-        doomed = self._folder(kind) / f"old-{uuid.uuid4().hex}"
-        os.rename(self._path(kind, step), doomed)
+        folder = check_no_link(self._folder(kind))
+        doomed = folder / f"old-{uuid.uuid4().hex}"
+        with access(folder, "written"):
+            os.rename(self._path(kind, step), doomed)
         shutil.rmtree(doomed, ignore_errors=True)
-
-    @staticmethod
-    def _clean(folder: Path) -> None:
-        """Makes `folder` and removes what a killed process left half-written or half-deleted."""
-        folder.mkdir(parents=True, exist_ok=True)
-        for name in os.listdir(folder):
-            if name.startswith(("new-", "old-")):
-                shutil.rmtree(folder / name, ignore_errors=True)
 
 
 def is_key(leaf: Any) -> bool:

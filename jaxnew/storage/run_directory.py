@@ -5,12 +5,31 @@ provenance.json   what made it: revision, versions, devices, command line of eac
 metrics.jsonl     one line per report (`metrics.py`); TensorBoard events in tensorboard/
 checkpoints/      `checkpoint.py`
 figures/  evaluation/*.json
+
+Beside the directory NAME there are, only while a process makes or replaces it:
+
+.NAME.new-TOKEN        the run that is being made, locked by its maker
+.NAME.replaced-TOKEN   the run that the one of the same token replaces
+
+A new run is made whole in `.NAME.new-TOKEN` and renamed to NAME. With `overwrite`, NAME is renamed
+to `.NAME.replaced-TOKEN` between the two, and deleted last. So whatever kills the process:
+
+NAME     new    replaced   what was killed, and what opening NAME for writing does
+absent   yes    no         the making: removes `new`
+there    yes    no         the making of a replacement: removes `new`; NAME is the old run
+absent   yes    yes        between the two renames: renames `replaced` back, removes `new`
+there    no     yes        the deleting: removes `replaced`; NAME is the new run
+absent   no     yes        the deleting, and NAME was deleted since: removes `replaced`
+
+What a living process has locked is left alone. NAME alone is ever read, so a run either is there
+whole or is not there.
 """
 
 from __future__ import annotations
 
 import contextlib
 import datetime
+import hashlib
 import importlib.metadata
 import json
 import os
@@ -27,14 +46,25 @@ from pathlib import Path
 from typing import Any, Self
 
 from jaxnew.storage.config import Difference, differences
-from jaxnew.storage.files import sync_folder, take_lock, write_json_atomically
+from jaxnew.storage.files import (
+    StorageError,
+    access,
+    check_name,
+    check_no_link,
+    read_json,
+    remove_temporaries,
+    sync_folder,
+    take_lock,
+    write_json_atomically,
+)
 
 _KIND = "jaxnew run directory"
 _FORMAT_VERSION = 1
 _LOCK = ".lock"
 _PACKAGES = ("jax", "jaxlib", "flax", "optax", "numpy", "orbax-checkpoint", "mujoco", "pymunk")
 _FOLDERS = ("tensorboard", "checkpoints", "figures", "evaluation")
-
+_OF_SWEEPS = ("members", "members.partial")
+_HASH = "hash"  # In files of evaluations.
 
 _SHORT = reprlib.Repr()  # Cuts groups of fields and long lists.
 _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 16, 200, 200
@@ -67,28 +97,19 @@ class ConfigMismatch(RunDirectoryError):
         )
 
 
-def _read_json(path: Path) -> Any:
+def _read_object(path: Path) -> dict[str, Any]:
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
+        return dict(read_json(path, RunDirectoryError))
     except FileNotFoundError as err:
         raise RunDirectoryError(
             f"{path.parent} is not a run directory: {path.name} is missing. Give the --workdir of "
             "a run."
         ) from err
-    except (json.JSONDecodeError, UnicodeDecodeError) as err:
-        raise RunDirectoryError(
-            f"{path} is damaged ({err}). Restore it from a copy, or start a new run in another "
-            "--workdir."
-        ) from err
 
 
-def _read_object(path: Path) -> dict[str, Any]:
-    content = _read_json(path)
-    if not isinstance(content, dict):
-        raise RunDirectoryError(
-            f"{path} is damaged: it must hold a JSON object, got a {type(content).__name__}."
-        )
-    return content
+def _hash_of(content: Mapping[str, Any]) -> str:
+    """Of an evaluation, as it is written beside it."""
+    return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
 def _lock(folder: Path) -> int:
@@ -141,24 +162,25 @@ class RunDirectory:
           ConfigMismatch: the run there has another configuration.
           RunDirectoryInUse: another process writes it.
           RunDirectoryError: the path holds something else, or a damaged run.
+          StorageError: the system refuses, or a folder of the run is a link.
         """
         path = Path(os.path.abspath(path))
+        check_name(path)
         plain = json.loads(json.dumps(config, allow_nan=False))
-        _restore_interrupted_overwrite(path)
-        is_empty = not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
-        if is_empty:
-            run = cls(path, plain, False, _create(path, plain))
-        elif overwrite:
-            run = cls(path, plain, False, _replace(path, plain))
-        else:
-            run = _resume(cls, path, plain, upgrade)
-        try:
-            if overwrite:
-                shutil.rmtree(_aside(path), ignore_errors=True)
-            run._record_session(extra_provenance or {})
-        except BaseException:
-            run.close()
-            raise
+        with access(path, "written"):
+            _settle(path)
+            is_empty = not os.path.lexists(path) or (path.is_dir() and not any(path.iterdir()))
+            if is_empty:
+                run = cls(path, plain, False, _create(path, plain))
+            elif overwrite:
+                run = cls(path, plain, False, _replace(path, plain))
+            else:
+                run = _resume(cls, path, plain, upgrade)
+            try:
+                run._record_session(extra_provenance or {})
+            except BaseException:
+                run.close()
+                raise
         return run
 
     @classmethod
@@ -167,10 +189,13 @@ class RunDirectory:
 
         Raises:
           RunDirectoryError: `path` is not a run directory, or it is damaged.
+          StorageError: the system refuses to read it.
         """
         path = Path(path)
-        _check_marker(path)
-        return cls(path, _read_object(path / "config.json"), True, None)
+        check_name(path)
+        with access(path):
+            _check_marker(path)
+            return cls(path, _read_object(path / "config.json"), True, None)
 
     @property
     def is_writable(self) -> bool:
@@ -183,7 +208,26 @@ class RunDirectory:
 
     @property
     def figures(self) -> Path:
-        return self.path / "figures"
+        """Where its figures go.
+
+        Raises:
+          StorageError: it is a link.
+        """
+        return check_no_link(self.path / "figures")
+
+    @property
+    def has_been_saved(self) -> bool:
+        """Whether it had a `latest` checkpoint at any time; runs of 0.2.0 and before do not tell,
+        and count as such.
+        """
+        return bool(self.provenance.get("has_been_saved", True))
+
+    def note_saved(self) -> None:
+        """Records that there is a `latest` checkpoint: without one the run is never begun anew."""
+        self._check_writable()
+        if not self.has_been_saved:
+            provenance = {**self.provenance, "has_been_saved": True}
+            write_json_atomically(self.path / "provenance.json", provenance)
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -198,19 +242,48 @@ class RunDirectory:
         write_json_atomically(self.path / "provenance.json", provenance)
 
     def record_evaluation(self, name: str, content: Mapping[str, Any]) -> Path:
-        """Writes `evaluation/NAME.json`, replacing an earlier one. Needs no lock.
+        """Writes `evaluation/NAME.json`, replacing an earlier one, with a hash. Needs no lock.
 
         Raises:
           ValueError: `name` is not a plain file name, or `content` is not plain JSON.
+          StorageError: the system refuses, or the folder is a link.
         """
         if not re.fullmatch(r"[A-Za-z0-9][A-Za-z0-9._-]*", name):
             raise ValueError(
                 f"Evaluation name {name!r} must consist of letters, digits, '.', '_' and '-'."
             )
-        file = self.path / "evaluation" / f"{name}.json"
-        file.parent.mkdir(exist_ok=True)
-        write_json_atomically(file, dict(content))
+        file = check_no_link(self.path / "evaluation") / f"{name}.json"
+        with access(file, "written"):
+            file.parent.mkdir(exist_ok=True)
+        write_json_atomically(file, {**content, _HASH: _hash_of(content)})
         return file
+
+    def evaluation(self, name: str) -> dict[str, Any]:
+        """What `record_evaluation` wrote.
+
+        Raises:
+          FileNotFoundError: there is none of that name.
+          RunDirectoryError: the file was damaged or edited. Those of 0.2.0 and before have no hash.
+        """
+        file = self.path / "evaluation" / f"{name}.json"
+        content = dict(read_json(file, RunDirectoryError))
+        recorded = content.pop(_HASH, None)
+        if recorded not in (None, _hash_of(content)):
+            raise RunDirectoryError(
+                f"{file} was edited or damaged: its hash is {_hash_of(content)}, it says "
+                f"{recorded}. Restore it from a copy, or move it away and evaluate again."
+            )
+        return content
+
+    def evaluations(self) -> dict[str, dict[str, Any]]:
+        """All evaluations on record by name, in the order of names.
+
+        Raises:
+          RunDirectoryError: see `evaluation`.
+        """
+        with access(self.path / "evaluation"):
+            names = sorted(file.stem for file in self.path.glob("evaluation/[!.]*.json"))
+        return {name: self.evaluation(name) for name in names}
 
     def close(self) -> None:
         """Releases the lock; the object can still be read."""
@@ -242,8 +315,8 @@ def _check_marker(path: Path) -> None:
     for name in ("config.json", "provenance.json"):
         if not (path / name).exists():
             raise RunDirectoryError(
-                f"{path} is not a run directory: it has no {name}. Choose a --workdir that does "
-                "not exist yet or is empty."
+                f"{path} is not a run directory: it has no {name}. Give the directory of a run, or "
+                "for a new one a --workdir that does not exist yet or is empty."
             )
     kind = _read_object(path / "provenance.json")
     if kind.get("kind") != _KIND or kind.get("format_version") != _FORMAT_VERSION:
@@ -263,44 +336,52 @@ def _resume(
     found = differences(upgrade(_read_object(path / "config.json")), config)
     if found:
         raise ConfigMismatch(path, found)
-    return cls(path, config, True, _lock(path))
+    for name in (*_FOLDERS, *_OF_SWEEPS):
+        check_no_link(path / name)
+    lock = _lock(path)
+    remove_temporaries(path)
+    return cls(path, config, True, lock)
 
 
 def _create(path: Path, config: dict[str, Any]) -> int:
     """Makes the run at `path`, which is absent or empty, in one step; returns its lock."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.new-"))
-    os.chmod(folder, 0o755)
-    lock = _lock(folder)
+    folder, lock = _make(path, config)
     try:
-        for name in _FOLDERS:
-            (folder / name).mkdir()
-        marker = {"kind": _KIND, "format_version": _FORMAT_VERSION, "sessions": []}
-        write_json_atomically(folder / "provenance.json", marker)
-        write_json_atomically(folder / "config.json", config)
         os.rename(folder, path)
     except BaseException as err:
         os.close(lock)
-        shutil.rmtree(folder, ignore_errors=True)
         if not isinstance(err, OSError):
             raise
+        shutil.rmtree(folder, ignore_errors=True)
         raise RunDirectoryError(
-            f"Cannot make the run directory {path}: {err}. Choose a --workdir inside a writable "
-            "directory; it must not be a mount point or a link."
+            f"Cannot make the run directory {path}: {err.strerror}. Choose a --workdir that does "
+            "not exist yet or is empty; it must not be a mount point or a link."
         ) from err
     sync_folder(path.parent)
     return lock
 
 
-def _aside(path: Path) -> Path:
-    """Where an existing run waits while the one that replaces it is put in place."""
-    return path.parent / f".{path.name}.replaced"
-
-
-def _restore_interrupted_overwrite(path: Path) -> None:
-    """Undoes a replacement that was killed between its two renames."""
-    if not os.path.lexists(path) and _aside(path).is_dir():
-        os.rename(_aside(path), path)
+def _make(path: Path, config: dict[str, Any]) -> tuple[Path, int]:
+    """Makes the run that is going to be at `path`, beside it; returns its folder and lock."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    folder = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}.new-"))
+    try:
+        os.chmod(folder, 0o755)
+        lock = _lock(folder)
+        try:
+            for name in _FOLDERS:
+                (folder / name).mkdir()
+            marker = {"kind": _KIND, "format_version": _FORMAT_VERSION, "has_been_saved": False}
+            marker |= {"sessions": []}
+            write_json_atomically(folder / "provenance.json", marker)
+            write_json_atomically(folder / "config.json", config)
+        except BaseException:
+            os.close(lock)
+            raise
+    except Exception:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
+    return folder, lock
 
 
 def _replace(path: Path, config: dict[str, Any]) -> int:
@@ -310,14 +391,40 @@ def _replace(path: Path, config: dict[str, Any]) -> int:
     _check_marker(path)
     old_lock = _lock(path)
     try:
-        shutil.rmtree(_aside(path), ignore_errors=True)
-        os.rename(path, _aside(path))
+        folder, lock = _make(path, config)
         try:
-            return _create(path, config)
-        finally:
-            _restore_interrupted_overwrite(path)
+            aside = folder.name.replace(f".{path.name}.new-", f".{path.name}.replaced-")
+            os.rename(path, path.parent / aside)
+            os.rename(folder, path)
+            sync_folder(path.parent)
+            shutil.rmtree(path.parent / aside, ignore_errors=True)
+        except BaseException:
+            os.close(lock)
+            raise
     finally:
         os.close(old_lock)
+    return lock
+
+
+def _settle(path: Path) -> None:
+    """Ends what killed processes began beside `path`, as the docstring of this module says."""
+    if not path.parent.is_dir():
+        return
+    name = re.compile(rf"\.{re.escape(path.name)}\.(new|replaced)(-[a-z0-9_]{{8}})?")
+    locks: dict[tuple[str, str], int] = {}
+    try:
+        for folder in path.parent.iterdir():
+            if (found := name.fullmatch(folder.name)) and folder.is_dir():
+                with contextlib.suppress(BlockingIOError, StorageError):  # Somebody else's.
+                    locks[found[1], found[2] or ""] = take_lock(folder / _LOCK)
+        for kind, token in sorted(locks):
+            folder = path.parent / f".{path.name}.{kind}{token}"
+            if kind == "new" and ("replaced", token) in locks and not os.path.lexists(path):
+                os.rename(path.parent / f".{path.name}.replaced{token}", path)
+            shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        for lock in locks.values():
+            os.close(lock)
 
 
 def _git(*arguments: str) -> str | None:

@@ -185,6 +185,7 @@ def test_flags_of_another_mode_are_refused(policy_run: Path, tmp_path: Path) -> 
         ("embed", (*new, "--seed=3", "--frames=stored"), "--seed, --frames: of no meaning with"),
         ("embed", ("--budget=smoke", "--frames=stored"), "no drawn frames; leave out --frames"),
         ("collect", ("--budget=smoke", "--frames=on-demand"), "no drawn frames"),
+        ("collect", ("--budget=smoke", "--overwrite"), "--overwrite: of no meaning without --out"),
     ]
     for command, flags, says in cases:
         arguments = importlib.import_module(f"experiments.{command}").ARGUMENTS
@@ -193,6 +194,17 @@ def test_flags_of_another_mode_are_refused(policy_run: Path, tmp_path: Path) -> 
         with pytest.raises(UsageError, match=says):
             importlib.import_module(f"experiments.{command}").main()
     assert not any(tmp_path.iterdir())
+
+
+def test_a_table_is_not_replaced_unless_it_is_asked_for(tmp_path: Path) -> None:
+    output = tmp_path / "table.npz"
+    output.write_text("precious")
+    flags = [f"--{name}={tmp_path / name}" for name in ("checkpoint", "observations")]
+    job = (*flags, f"--output={output}")
+    refusal, next_error = refused("embed", [job, (*job, "--overwrite")])
+    assert f"{output} exists already" in refusal
+    assert "checkpoint is not a directory" in next_error
+    assert output.read_text() == "precious"
 
 
 def test_a_nan_stops_the_run_and_keeps_what_was_saved(runs: Path, tmp_path: Path) -> None:

@@ -199,8 +199,7 @@ def test_new_recordings_are_encoded(encoder: Encoder, tmp_path: Path) -> None:
 
 def test_its_report_is_kept(encoder: Encoder) -> None:
     numbers = encoder.report()
-    kept = json.loads((encoder.path / "evaluation" / "representation.json").read_text())
-    assert kept == numbers
+    assert RunDirectory.load(encoder.path).evaluation("representation") == numbers
     assert "rungs" in json.dumps(numbers)
 
 

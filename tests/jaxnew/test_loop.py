@@ -108,6 +108,7 @@ def outcome(path: Path) -> dict[str, Any]:
     for kind in ("latest", "best"):
         state, metadata = checkpointer.restore(kind, init())
         metadata.pop("elapsed_s")
+        metadata.pop("metrics")  # Of which times are a part.
         found[kind] = (int(state.step), digest(state), metadata)
     return found
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +13,14 @@ import numpy as np
 import pytest
 
 from jaxnew.actions import ActionIdentity, SplitMismatch
-from jaxnew.embedding import Encoder, embed
+from jaxnew.embedding import Encoder, embed, find_table
 from jaxnew.new_actions import offer
 from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.recording import record
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run
+from jaxnew.storage.files import StorageError
+from jaxnew.task.domain import Domain
 from jaxnew.task.places import UsageError
 from jaxnew.training import finetune, train
 from tests import toy_device
@@ -24,6 +28,7 @@ from tests import toy_device
 pytestmark = pytest.mark.integration
 
 LADDER = toy_device.TASK
+DOMAIN = Domain.of(LADDER)
 A = toy_device.A
 SHIFTED, GROWN = "3-30", "0-30"  # Its first is action 3 of ours, its last six are new.
 
@@ -99,6 +104,23 @@ def test_what_is_recorded_anew_is_what_was_recorded(encoder: Encoder, tmp_path: 
     (tmp_path / "ids.txt").write_text("3 1")
     listed = record(LADDER, tmp_path / "ids.txt", output=tmp_path / "c.npz", num_recordings=1)
     assert (listed.ids.tolist(), listed.num_recordings) == ([3, 1], 1)
+
+
+def test_a_file_is_not_replaced_unless_it_is_asked_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file, ids = tmp_path / "a.npz", np.array([7, 2], np.int32)
+    again = functools.partial(record, LADDER, output=file, budget="smoke")
+    before = again(ids).hash
+    with pytest.raises(StorageError, match=r"a\.npz exists already.*--overwrite"):
+        again(ids[:1])
+    assert Recordings.load(file).hash == before
+    with monkeypatch.context() as patch:
+        patch.setattr(shutil, "rmtree", lambda _: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):  # Killed when the file was there.
+            again(ids[:1], overwrite=True)
+    assert again(ids[:1]).ids.tolist() == [7]
+    assert os.listdir(tmp_path) == ["a.npz"]
 
 
 @pytest.mark.parametrize(
@@ -259,5 +281,9 @@ def test_files_of_a_run_that_were_exchanged_are_refused(
         train(LADDER, encoder.table, budget="smoke", workdir=copy)
     shutil.copytree(encoder.path, tmp_path / "encoder")
     other.save(tmp_path / "encoder" / "table.npz")
-    with pytest.raises(SplitMismatch, match=r"The table in .*encoder is not the run's own"):
-        Encoder.load(tmp_path / "encoder")
+    for use in (Encoder.load, lambda path: find_table(DOMAIN, tmp_path, str(path), "smoke")):
+        with pytest.raises(SplitMismatch, match=r"The table in .*encoder is not the run's own"):
+            use(tmp_path / "encoder")
+    (tmp_path / "encoder" / "table.npz").unlink()
+    with pytest.raises(UsageError, match=r"encoder has no table\.npz: it was interrupted; embed"):
+        find_table(DOMAIN, tmp_path, str(tmp_path / "encoder"), "smoke")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -41,8 +40,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 def results(run: Run) -> dict[str, Any]:
     """What is in the run's directory, by file."""
-    files = sorted((run.path / "evaluation").glob("*.json"))
-    return {file.stem: json.loads(file.read_text()) for file in files}
+    return RunDirectory.load(run.path).evaluations()
 
 
 def test_a_run_is_loaded_from_its_directory_or_a_checkpoint(run: Run) -> None:

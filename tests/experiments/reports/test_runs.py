@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +18,9 @@ from experiments.reports.runs import policies, read_runs
 from jaxnew.representation.table import RepresentationTable, engineered_table
 from jaxnew.run import Question
 from jaxnew.storage import config as config_lib
-from jaxnew.storage.run_directory import RunDirectory
+from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.metrics import MetricsError, MetricsLog
+from jaxnew.storage.run_directory import RunDirectory, RunDirectoryError
 from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
 from tests.experiments.handwritten import groups_at, plain_config, write_evaluation, write_run
@@ -94,12 +98,46 @@ def test_another_split_is_not_compared_with_the_paper(tmp_path: Path) -> None:
 
 
 @pytest.mark.unit
-def test_a_damaged_evaluation_is_named(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("before", "after", "says"),
+    [
+        ('{"', "{", r"test-best-sampled-m50\.json is damaged \(Expecting"),
+        (
+            '"mean": 0.5',
+            '"mean": 0.6',
+            r"m50\.json was edited or damaged: its hash is [0-9a-f]{16}",
+        ),
+        # As 0.2.0 wrote it, and then altered.
+        (
+            '"mean": 0.5',
+            '"mean": 0.9',
+            r"m50\.json is damaged: the mean of is_success, 0\.9, is not",
+        ),
+        ('"low": 0.48', '"low": NaN', r"m50\.json is damaged: .* \[nan, 0\.51\]"),
+    ],
+)
+def test_a_damaged_evaluation_is_named(tmp_path: Path, before: str, after: str, says: str) -> None:
     path = write_run(tmp_path / "run", plain_config())
-    (path / "evaluation" / "test.json").write_text("{")
+    write_evaluation(path, "test", 0.5)
+    (file,) = (path / "evaluation").iterdir()
+    text = json.dumps(json.loads(file.read_text()))
+    if "was edited" not in says:
+        text = re.sub(', "hash": "[0-9a-f]*"', "", text)
+    file.write_text(text.replace(before, after))
     (run,) = read_runs([path])
-    with pytest.raises(UsageError, match=r"test\.json is damaged"):
+    with pytest.raises(RunDirectoryError, match=says):
         run.answer(Question("test", 50))
+
+
+@pytest.mark.unit
+def test_metrics_are_those_of_the_checkpoint(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "run", plain_config())
+    state, mark = {"step": 4}, MetricsLog(path).mark
+    Checkpointer(path / "checkpoints").save("latest", 4, state, {"metrics": mark})
+    assert len(read_runs([path])[0].reports) == 6
+    (path / "metrics.jsonl").unlink()
+    with pytest.raises(MetricsError, match=r"metrics\.jsonl is missing; .* 6 reports"):
+        read_runs([path])[0].reports  # noqa: B018
 
 
 @pytest.mark.unit

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import json
+import logging
 import os
+import resource
 import shutil
+import sys
+import warnings
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -17,6 +23,7 @@ import pytest
 from flax import struct
 
 from jaxnew.storage.checkpoint import Checkpointer, CheckpointError, record_hash
+from jaxnew.storage.files import StorageError
 
 
 @struct.dataclass
@@ -142,6 +149,66 @@ def test_the_newest_are_kept(tmp_path: Path) -> None:
 
 
 @pytest.mark.unit
+def test_a_full_disk_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No file may be as large as the checkpoint's, and what is there stays."""
+    printed: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda told: printed.append(str(told.exc_value)))
+    handler = logging.Handler(logging.ERROR)
+    monkeypatch.setattr(handler, "emit", lambda record: printed.append(record.getMessage()))
+    logging.getLogger("absl").addHandler(handler)
+    checkpointer, rng = Checkpointer(tmp_path), np.random.default_rng(0)
+    checkpointer.save("latest", 1, {"a": np.zeros(3)})
+    state = {f"a{i}": rng.normal(size=5000) for i in range(30)}
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, limits[1]))
+    try:
+        with pytest.raises(StorageError, match=r"0002 cannot be written: File too .*run the same"):
+            checkpointer.save("latest", 2, state)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        logging.getLogger("absl").removeHandler(handler)
+    # Threads of Orbax go on for a while, and whether they say so is a matter of chance.
+    sys.unraisablehook(SimpleNamespace(exc_value=RuntimeError("Event loop is closed")))  # type: ignore[arg-type]
+    assert printed == []
+    sys.unraisablehook(SimpleNamespace(exc_value=RuntimeError("Another")))  # type: ignore[arg-type]
+    assert printed == ["Another"]
+    assert os.listdir(tmp_path / "latest") == ["000000000001"]
+    checkpointer.save("latest", 2, state)
+    assert Checkpointer(tmp_path).steps("latest") == [1, 2]
+
+
+@pytest.mark.unit
+def test_damaged_ones_are_set_aside_and_kept(tmp_path: Path) -> None:
+    checkpointer, states = Checkpointer(tmp_path), [{"a": np.full(3, i)} for i in range(4)]
+    for step in (1, 2, 3):
+        checkpointer.save("best", step, states[step])
+    checkpointer.set_aside_damaged("best", states[0])
+    assert checkpointer.steps("best") == [1, 2, 3]
+    damage_record(tmp_path / "best" / "000000000001")  # Older than a whole one: left where it is.
+    truncate_data(tmp_path / "best" / "000000000003")
+    with pytest.warns(UserWarning, match="000000000003 is damaged .*; it is damaged-0000"):
+        checkpointer.set_aside_damaged("best", states[0])
+    assert checkpointer.steps("best") == [1, 2]
+    checkpointer.save("best", 3, states[3])
+    assert_same(Checkpointer(tmp_path).restore("best", states[0])[0], states[3])
+    assert [name.startswith("damaged-") for name in sorted(os.listdir(tmp_path / "best"))][-1]
+
+
+@pytest.mark.unit
+def test_links_are_not_written_through(tmp_path: Path) -> None:
+    other = tmp_path / "other" / "new-thesis"
+    other.mkdir(parents=True)
+    (tmp_path / "latest").symlink_to(tmp_path / "other")
+    checkpointer = Checkpointer(tmp_path)
+    with pytest.raises(StorageError, match="latest is a link to"):
+        checkpointer.save("latest", 1, {"a": 1})
+    (other.parent / "000000000007").mkdir()
+    with pytest.raises(StorageError, match="latest is a link to"):
+        checkpointer.discard_after(1)
+    assert sorted(os.listdir(other.parent)) == ["000000000007", "new-thesis"]
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize("step", [-1, 2, 3])
 def test_steps_must_grow(tmp_path: Path, step: int) -> None:
     checkpointer = Checkpointer(tmp_path)
@@ -216,7 +283,8 @@ def test_damage_falls_back_or_is_an_error(tmp_path: Path, damage: Any) -> None:
     with pytest.raises(CheckpointError, match="No readable checkpoint") as caught:
         Checkpointer(tmp_path).restore("latest", states[0])
     assert str(tmp_path) in str(caught.value)
-    assert "delete" in str(caught.value)
+    text = str(caught.value)
+    assert -1 < text.index("Restore it from a copy") < text.index("delete")
 
 
 # Orbax leaves futures behind when TensorStore fails.
@@ -326,6 +394,56 @@ def test_a_save_killed_at_any_rename_or_deletion_leaves_the_newest_readable(
             assert call > 4  # Every instant was tried.
             return
     pytest.fail("40 calls were not enough")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("what", ["discard", "set aside"])
+def test_discarding_killed_anywhere_leaves_the_rest_readable(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    example = {"a": jnp.float32(0)}
+    for step in (1, 2, 3):
+        Checkpointer(tmp_path / "whole").save("best", step, {"a": jnp.float32(step)})
+    for step in (2, 3) if what == "set aside" else ():
+        damage_record(tmp_path / "whole" / "best" / f"{step:012d}")
+    for call in itertools.count():
+        folder, calls = tmp_path / str(call), [0]
+        shutil.copytree(tmp_path / "whole", folder)
+
+        def dying(real: Any, calls: list[int] = calls, call: int = call) -> Any:
+            def function(*arguments: Any, **named: Any) -> Any:
+                calls[0] += 1
+                if calls[0] > call:
+                    raise Killed
+                return real(*arguments, **named)
+
+            return function
+
+        with monkeypatch.context() as patch, warnings.catch_warnings(action="ignore"):
+            for name in ("rename", "unlink", "rmdir"):
+                patch.setattr(os, name, dying(getattr(os, name)))
+            try:
+                if what == "discard":
+                    Checkpointer(folder).discard_after(1)
+                else:
+                    Checkpointer(folder).set_aside_damaged("best", example)
+            except Killed:
+                is_killed = True
+            else:
+                is_killed = False
+        after = Checkpointer(folder)
+        assert after.steps("best")[0] == 1
+        after.clean("best")
+        with warnings.catch_warnings(action="ignore"):
+            restored, _ = after.restore("best", example)
+        assert float(restored["a"]) == (1 if what == "set aside" else after.steps("best")[-1])
+        left = [name for name in os.listdir(folder / "best") if not name.isdecimal()]
+        assert all(name.startswith("damaged-") for name in left)
+        assert len(left) + len(after.steps("best")) == 3 or what == "discard"
+        if not is_killed:
+            assert after.steps("best") == [1]
+            assert call > 1  # Every instant was tried.
+            return
 
 
 @pytest.mark.unit
