@@ -77,6 +77,8 @@ def evaluate_sweep(runs: Runs) -> None:
     for run in runs.load_each(ARGUMENTS.checkpoint or "best"):
         evaluated(run)
         print(f"{run.path} evaluated.", flush=True)
+    for row in runs.diverged:
+        print(f"{row['path']} diverged by update {row['diverged_at']}; not evaluated.")
     for file in show_sweep(runs):
         print(file)
 

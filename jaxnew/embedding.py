@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,6 @@ from jaxnew.representation import report
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.learner import RepresentationLearner, RepresentationState
 from jaxnew.representation.modality import Modality
-from jaxnew.representation.sources import RecordingSource
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
@@ -282,7 +280,7 @@ def _train(
         print(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
     result = loop.run(
         learner.init(jax.random.key(config.seed), data.shape),
-        lambda state, n: _train_chunk(learner, data, state, n),
+        lambda state, n: learner.train_steps(state, data, n),
         directory,
         loop.Rhythm(model.num_steps, chunk_steps, preset.checkpoint_every),
         loop.Display(
@@ -310,17 +308,6 @@ def _train(
     table.save(directory.path / TABLE_FILE)
     directory.add_provenance(table_hash=table.hash)
     return None
-
-
-def _train_chunk(
-    learner: RepresentationLearner,
-    data: jax.Array | RecordingSource,
-    state: RepresentationState,
-    n: int,
-) -> tuple[RepresentationState, Mapping[str, Any]]:
-    state, metrics = learner.train_steps(state, data, n)
-    metrics["nonfinite/loss_and_gradient"] = metrics.pop("nonfinite")
-    return state, metrics
 
 
 def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:

@@ -25,6 +25,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnew import finiteness
 from jaxnew.storage.checkpoint import KINDS, Checkpointer, CheckpointError, Kind
 from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog, read
 from jaxnew.storage.progress import ProgressDisplay, duration
@@ -375,20 +376,29 @@ class _Session(Generic[State]):
         return values
 
     def _check_finite(self, values: Mapping[str, float]) -> None:
+        cause = finiteness.cause_of(values)
+        if cause is not None:
+            what, advice = finiteness.CAUSES[cause]
+            name = finiteness.PREFIX + cause
+            said = f"{what}, before anything else ({name} is {values[name]:g})"
+            self._stop(said, values, advice)
         for name, value in values.items():
-            counted = name.startswith("nonfinite/") and value != 0
             may_be_nan = any(fnmatch.fnmatchcase(name, pattern) for pattern in self._may_be_nan)
-            if counted or (not math.isfinite(value) and not may_be_nan):
+            if not math.isfinite(value) and not may_be_nan:
                 self._stop(f"{name} is {value}", values)
 
-    def _stop(self, what: str, values: Mapping[str, float]) -> None:
+    def _stop(
+        self,
+        what: str,
+        values: Mapping[str, float],
+        advice: str = finiteness.CAUSES["parameter"][1],
+    ) -> None:
         self.log.sync()
         steps = self._checkpointer.steps("latest")
         last = f"the checkpoint of step {steps[-1]} is good" if steps else "none was saved before"
         listed = ", ".join(f"{name}={value:.4g}" for name, value in values.items())
         raise NonFiniteError(
-            f"{what} at step {self.step}; {last}. Lower the learning rate, or rerun with "
-            f"--debug_nans to find the operation. Metrics: {listed}"
+            f"{what} at step {self.step}; {last}. {advice}{f' Metrics: {listed}' * bool(values)}"
         )
 
     def report(self, metrics: Mapping[str, float], before: int, display: Display) -> str:

@@ -8,11 +8,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self, cast
 
+import jax
 import numpy as np
 
 from jaxnew.actions import ActionSplit, check_same, mixture_ids
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.evaluation import EVALUATION_SEED, measure, play, summarize
+from jaxnew.loop import NonFiniteError
 from jaxnew.new_actions import offer
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.contract import Episode, Policy
@@ -117,6 +119,7 @@ class Run:
       policy: parameters and statistics of the checkpoint.
       step: updates that it was trained for.
       checkpoint: kind of the checkpoint, `best` (by validation) or `latest`.
+      diverged_at: update by which the run, a member of a sweep, diverged; None if it did not.
       interrupted_by: number of the signal that stopped its training just now, or None.
     """
 
@@ -126,6 +129,7 @@ class Run:
     step: int
     checkpoint: str
     interrupted_by: int | None = None
+    diverged_at: int | None = None
 
     @classmethod
     def load(
@@ -151,6 +155,7 @@ class Run:
           RunDirectoryError, ConfigError: it is no run of a policy.
           SplitMismatch: split or table were changed since.
           CheckpointError: there is no such checkpoint.
+          NonFiniteError: there is none, because the run diverged before.
         """
         path, named = locate(Path(path))
         directory = RunDirectory.load(path)
@@ -162,8 +167,14 @@ class Run:
         """A checkpoint of a run whose parts are there."""
         example = trainer.learner.policy_shapes(trainer.training)
         checkpointer = Checkpointer(path / "checkpoints")
-        state, _ = checkpointer.restore(checkpoint, example, is_part=True)
-        return cls(path, trainer, state.policy, int(state.step), checkpoint)
+        if not checkpointer.steps(checkpoint) and checkpointer.steps("latest"):
+            update = checkpointer.metadata("latest").get("diverged_at")
+            if update is not None:
+                raise _unsound(f"{path} diverged by update {update}, before its first evaluation")
+        state, metadata = checkpointer.restore(checkpoint, example, is_part=True)
+        diverged_at = metadata.get("diverged_at")
+        step = int(state.step)
+        return cls(path, trainer, state.policy, step, checkpoint, diverged_at=diverged_at)
 
     @property
     def was_interrupted(self) -> bool:
@@ -226,7 +237,9 @@ class Run:
           UsageError: several of `parts`, `ids`, `table`, `unseen_ratio` are given, or see `offer`.
           SplitMismatch: the table is none for this run, see `offer`.
           ValueError: there are no such sets.
+          NonFiniteError: the run diverged, or parameters of its policy are not finite.
         """
+        self._check_sound()
         check_seed(seed, "seed of the evaluation")
         named = (parts,) if isinstance(parts, str) else tuple(parts)
         if sum((bool(named), ids is not None, table is not None, unseen_ratio is not None)) > 1:
@@ -304,9 +317,19 @@ class Run:
           part: of the split, that available sets are drawn from.
           first, count: numbers of the episodes.
           seed: of the evaluation.
+
+        Raises:
+          NonFiniteError: as of `evaluate`.
         """
+        self._check_sound()
         actions = self.trainer.actions(part)
         return play(self.trainer.rollout, self.policy, actions, first, count, seed)
+
+    def _check_sound(self) -> None:
+        if self.diverged_at is not None:
+            raise _unsound(f"{self.path} diverged by update {self.diverged_at}")
+        if any(not np.isfinite(leaf).all() for leaf in jax.tree.leaves(self.policy)):
+            raise _unsound(f"Parameters of {self.path}, {self.checkpoint}, are not finite")
 
     def acting_as(self, policy: Policy, name: str) -> Run:
         """The same run with other parameters, recorded under another name."""
@@ -354,6 +377,13 @@ def load_trainer(
     check_same("split", split.hash, config.split_hash, directory.path)
     check_same("table", table.hash, config.table_hash, directory.path)
     return Trainer.of(config, task, split, table, num_workers)
+
+
+def _unsound(what: str) -> NonFiniteError:
+    return NonFiniteError(
+        f"{what}, so that nothing it plays tells anything. `nonfinite/*` in its metrics.jsonl says "
+        "what was not finite first; train again with other settings."
+    )
 
 
 def file_stem(content: Mapping[str, Any]) -> str:

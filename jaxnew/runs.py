@@ -27,8 +27,10 @@ class Runs:
 
     Attributes:
       path: directory of the sweep.
-      rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s` and every
-        hyper-parameter. Empty where the sweep was interrupted: sweep again to go on.
+      rows: of each run: `path`, `seed`, `best_metric`, `best_step`, `elapsed_s`, every
+        hyper-parameter, and `diverged_at` and `diverged_by`: the update by which it diverged and
+        what was not finite first (`jaxnew.finiteness.CAUSES`), or None. Empty where the sweep was
+        interrupted: sweep again to go on.
       task: what they were trained on.
       interrupted_by: number of the signal that stopped the sweep just now, or None.
     """
@@ -91,7 +93,7 @@ class Runs:
 
     def groups(self) -> list[tuple[dict[str, Any], dict[str, np.ndarray]]]:
         """Per combination of what was varied its values, and f64[n] over seeds of each number:
-        of `best_metric` and of the evaluations of `table`.
+        of `best_metric` and of the evaluations of `table`. Runs that diverged count nowhere.
         """
         table, varied = self.table(), self.varied
         known = {
@@ -99,12 +101,15 @@ class Runs:
             "seed",
             "best_step",
             "elapsed_s",
+            "diverged_at",
+            "diverged_by",
             *(f.name for f in fields(Hyperparameters)),
         }
         names = list(dict.fromkeys(name for row in table for name in row if name not in known))
         found: dict[tuple[Any, ...], list[dict[str, Any]]] = {}
         for row in table:
-            found.setdefault(tuple(row[name] for name in varied), []).append(row)
+            seeds = found.setdefault(tuple(row[name] for name in varied), [])
+            seeds += [row] * (row["diverged_at"] is None)
         return [
             (
                 dict(zip(varied, values, strict=True)),
@@ -117,11 +122,14 @@ class Runs:
         """Rows for `pandas.DataFrame`, one per combination of what was varied.
 
         Its values, and of each number of `groups` the mean over seeds, `NAME_std`, the population
-        deviation, and `NAME_seeds`, how many have it; `is_best`: the best mean by validation.
+        deviation, and `NAME_seeds`, how many have it; `diverged`: how many seeds did; `is_best`:
+        the best mean by validation.
         """
         rows: list[dict[str, Any]] = []
         for values, numbers in self.groups():
             row = dict(values)
+            seeds = [r for r in self.diverged if all(r[n] == v for n, v in values.items())]
+            row["diverged"] = len(seeds)
             for name, of_seeds in numbers.items():
                 has_any = bool(of_seeds.size)
                 row[name] = float(of_seeds.mean()) if has_any else None
@@ -131,6 +139,11 @@ class Runs:
         rated = [row["best_metric"] for row in rows if row["best_metric"] is not None]
         best = max(rated, default=None)
         return [{**row, "is_best": best is not None and row["best_metric"] == best} for row in rows]
+
+    @property
+    def diverged(self) -> list[Mapping[str, Any]]:
+        """The rows of the runs that diverged."""
+        return [row for row in self.rows if row["diverged_at"] is not None]
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -142,11 +155,11 @@ class Runs:
     def load_each(self, checkpoint: Kind = "best") -> Iterator[Run]:
         """Loads one run after the other; they share their compiled parts.
 
-        Runs that were never evaluated in training, because they diverged, have no `best`.
+        Runs that diverged are left out, and for `best` those that were not evaluated in training.
         """
         trainer = None
         for row in self.rows:
-            if checkpoint == "best" and row["best_metric"] is None:
+            if row in self.diverged or (checkpoint == "best" and row["best_metric"] is None):
                 continue
             directory = RunDirectory.load(row["path"])
             trainer = trainer or load_trainer(directory, task=self.task)
@@ -154,12 +167,13 @@ class Runs:
             yield Run.of(directory.path, replace(trainer, config=config), checkpoint)
 
     def best(self) -> Run:
-        """The run with the highest validation.
+        """The run with the highest validation of those that did not diverge.
 
         Raises:
           UsageError: the sweep was interrupted, or nothing was evaluated.
         """
-        rated = [row for row in self.rows if row["best_metric"] is not None]
+        sound = [row for row in self.rows if row not in self.diverged]
+        rated = [row for row in sound if row["best_metric"] is not None]
         if not rated:
             raise UsageError(f"{self.path} has no evaluated runs; sweep again to go on.")
         best = max(rated, key=lambda row: row["best_metric"])
@@ -170,7 +184,8 @@ def _row(recorded: Mapping[str, Any], folder: Path) -> dict[str, Any]:
     """A row of `Runs`, wherever the sweep was moved to, and whichever version wrote it."""
     row = dict(recorded)
     path = Path(row.pop("path", None) or row.pop("member"))
-    return {"path": str(folder / path.name), **row.pop("hyperparameters", {}), **row}
+    unknown = {"diverged_at": None, "diverged_by": None}
+    return {"path": str(folder / path.name), **unknown, **row.pop("hyperparameters", {}), **row}
 
 
 def is_sweep(directory: RunDirectory) -> bool:

@@ -21,6 +21,7 @@ from flax import struct
 
 from jaxnew import loop
 from jaxnew.evaluation import EVALUATION_SEED
+from jaxnew.finiteness import CAUSES, PREFIX, cause_of
 from jaxnew.ppo import Hyperparameters, TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.rollout.device import DeviceRollout
@@ -44,6 +45,8 @@ from jaxnew.training import named_table, open_run, train_config
 class SweepState:
     """The members of a sweep; every leaf has a leading axis of M members.
 
+    A member that diverged stays as it was before the chunk in which it did, its step as well.
+
     Attributes:
       members: training states.
       best: the state of each member at its best validation so far.
@@ -56,8 +59,13 @@ class SweepState:
 
     @property
     def step(self) -> int:
-        """Updates done; the same for all members."""
-        return int(self.members.step[0])
+        """Updates done, by all members that have not diverged."""
+        return int(jnp.max(self.members.step))
+
+    @property
+    def is_running(self) -> np.ndarray:
+        """bool[M] the members that have not diverged."""
+        return np.asarray(self.members.step) == self.step
 
 
 @dataclass(frozen=True)
@@ -147,10 +155,15 @@ class SweepProgram:
     def _updates(self) -> Any:
         def run(members: TrainState, hyperparameters: Hyperparameters, n: int) -> Any:
             actions = self.trainer.training
-            update = self._for_members(
-                lambda state, numbers: self.trainer.learner.updates(state, numbers, actions, n)
-            )
-            return update(members, hyperparameters)
+
+            def updated(state: TrainState, numbers: Hyperparameters, is_running: jax.Array) -> Any:
+                found, metrics = self.trainer.learner.updates(state, numbers, actions, n)
+                is_sound = sum(v for name, v in metrics.items() if name.startswith(PREFIX)) == 0
+                is_kept = is_running & is_sound
+                return jax.tree.map(lambda x, y: jnp.where(is_kept, x, y), found, state), metrics
+
+            is_running = members.step == jnp.max(members.step)
+            return self._for_members(updated)(members, hyperparameters, is_running)
 
         return jax.jit(run, static_argnames="n")
 
@@ -182,32 +195,64 @@ class SweepProgram:
     @cached_property
     def _keep_best(self) -> Any:
         def keep(state: SweepState, metric: jax.Array) -> SweepState:
-            is_better = metric > state.best_metric
+            is_running = state.members.step == jnp.max(state.members.step)
+            is_better = is_running & (metric > state.best_metric)
 
             def pick(new: jax.Array, old: jax.Array) -> jax.Array:
                 return jnp.where(is_better.reshape(-1, *[1] * (new.ndim - 1)), new, old)
 
             best = jax.tree.map(pick, state.members, state.best)
-            return SweepState(state.members, best, jnp.maximum(metric, state.best_metric))
+            best_metric = jnp.where(is_better, metric, state.best_metric)
+            return SweepState(state.members, best, best_metric)
 
         return jax.jit(keep)
 
     def chunk(self, state: SweepState, num_updates: int) -> tuple[SweepState, dict[str, float]]:
-        """Updates, and an evaluation where one is due; metrics are named `MEMBER/metric`."""
+        """Updates, and an evaluation where one is due; metrics are named `MEMBER/metric`.
+
+        Raises:
+          NonFiniteError: no member is left that has not diverged.
+        """
+        was_running, step = state.is_running, state.step + num_updates
         members, metrics = self._updates(state.members, self.hyperparameters, n=num_updates)
         state = replace(state, members=members)
-        config, step = self.trainer.config, state.step
+        metrics = _of_members(metrics, was_running)
+        self._tell_diverged(state, was_running, metrics, step)
+        config = self.trainer.config
         is_last = step == config.num_updates
         if is_last or loop.is_passed(config.loop.evaluate_every, step - num_updates, step):
             results = self._evaluation(members)
             state = self._keep_best(state, results[self.trainer.selection_metric])
-            metrics = {**metrics, **results}
-        values = {name: np.asarray(value) for name, value in metrics.items()}
+            metrics |= _of_members(results, state.is_running)
         return state, {
             f"{member:03d}/{name}": float(value[member])
-            for name, value in values.items()
+            for name, value in metrics.items()
             for member in range(len(self.configs))
         }
+
+    def _tell_diverged(
+        self, state: SweepState, was_running: np.ndarray, metrics: Mapping[str, Any], step: int
+    ) -> None:
+        """Says which members diverged in a chunk that was to end at `step`.
+
+        Raises:
+          NonFiniteError: none is left.
+        """
+        steps, names = np.asarray(state.members.step), member_names(self.configs)
+        for member in np.flatnonzero(was_running & (steps < step)):
+            cause = cause_of({name: value[member] for name, value in metrics.items()})
+            what, advice = CAUSES[cause or "parameter"]
+            print(f"{names[member]} diverged by update {step}: {what} first. {advice}", flush=True)
+        if steps.max() < step:
+            raise loop.NonFiniteError(
+                f"All {len(names)} members diverged, the last by update {step}; see above, or "
+                "nonfinite/* of the metrics. Vary other values."
+            )
+
+
+def _of_members(metrics: Mapping[str, Any], are_meant: np.ndarray) -> dict[str, np.ndarray]:
+    """f32[M] each, NaN for members that are not meant."""
+    return {name: np.where(are_meant, np.asarray(value), np.nan) for name, value in metrics.items()}
 
 
 def sweep(
@@ -240,6 +285,7 @@ def sweep(
 
     Raises:
       UsageError: the environments run on the host, or as of `train`.
+      NonFiniteError: every member diverged.
     """
     task = load_task(task) if isinstance(task, str) else task
     if task.host is not None:
@@ -277,7 +323,7 @@ def sweep(
                 f"sweep of {len(configs)}",
                 work_per_step=base.ppo.steps_per_update * len(configs),
             ),
-            may_be_nan=("*",),  # One diverged member does not end the others.
+            may_be_nan=("*",),  # Members that diverged have no numbers.
         )
         if result.was_interrupted:
             return Runs(path, (), task, result.interrupted_by)
@@ -365,6 +411,7 @@ def write_members(directory: RunDirectory, program: SweepProgram, state: SweepSt
             "best_metric": best_metric if has_best else None,
             "best_step": int(best.step) if has_best else None,
             "elapsed_s": lines[-1].get("time/elapsed_s", 0.0),
+            **_divergence(lines, f"{index:03d}/"),
         }
         if not members.exists():
             trainer = replace(program.trainer, config=config)
@@ -373,13 +420,24 @@ def write_members(directory: RunDirectory, program: SweepProgram, state: SweepSt
                 checkpointer, kept = Checkpointer(member.checkpoints), {**metadata, "metrics": mark}
                 if has_best:
                     checkpointer.save("best", int(best.step), best, kept)
-                checkpointer.save("latest", config.num_updates, latest, kept)
+                checkpointer.save("latest", int(latest.step), latest, kept)
                 member.note_saved()
         numbers = plain(config.hyperparameters)
         rows.append({"path": str(path), "seed": config.seed, **metadata, **numbers})
     if not members.exists():
         partial.rename(members)
     directory.record_evaluation(MEMBERS, {MEMBERS: rows})
+
+
+def _divergence(lines: Sequence[Mapping[str, Any]], prefix: str) -> dict[str, Any]:
+    """At which update a member had diverged, and what was not finite first; None if it did not."""
+    for line in lines:
+        cause = cause_of(
+            {n.removeprefix(prefix): v for n, v in line.items() if n.startswith(prefix)}
+        )
+        if cause is not None:
+            return {"diverged_at": line["step"], "diverged_by": cause}
+    return {"diverged_at": None, "diverged_by": None}
 
 
 def write_metrics(member: RunDirectory, lines: list[dict[str, Any]], prefix: str) -> dict[str, Any]:

@@ -23,7 +23,7 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # nothing of what is learned.
 LAYERS = (
     {"actions", "cores", "storage", "observations", "collection"},
-    {"sampling", "environment", "convolution"},
+    {"sampling", "environment", "convolution", "finiteness"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation"},

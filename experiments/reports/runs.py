@@ -6,7 +6,7 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -23,6 +23,7 @@ from experiments.reports.paper import (
 from experiments.reports.plots import Metric
 from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
+from jaxnew.finiteness import CAUSES, cause_of
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Question
 from jaxnew.runs import is_sweep
@@ -249,7 +250,16 @@ def _members(path: Path) -> list[Path]:
     members = sorted(p.parent for p in path.glob("members/*/config.json"))
     if not members:
         raise UsageError(f"The sweep {path} has written no members yet; run it to its end.")
-    return members
+    return [member for member in members if not _has_diverged(member)]
+
+
+@cache
+def _has_diverged(member: Path) -> bool:
+    """Whether a member of a sweep diverged, which is said once."""
+    cause = next(filter(None, map(cause_of, read(member))), None)
+    if cause is not None:
+        print(f"{member} is left out: {CAUSES[cause][0].lower()}, so that it diverged.")
+    return cause is not None
 
 
 def _read_run(path: Path) -> RunRecord:

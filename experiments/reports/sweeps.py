@@ -10,6 +10,7 @@ import numpy as np
 from experiments.reports import plots, tables
 from experiments.reports.plots import Metric
 from experiments.reports.study_report import Study, StudyPoint, study_figure
+from jaxnew.finiteness import CAUSES
 from jaxnew.runs import Runs
 from jaxnew.storage.run_directory import RunDirectory
 
@@ -35,8 +36,11 @@ def as_markdown(runs: Runs) -> str:
     rows = []
     for row in summary:
         numbers = [_number(row, name, metric) for name in names]
-        rows.append([*(f"{row[name]:g}" for name in varied), *numbers, "best" * row["is_best"]])
-    header = [*varied, *(_title(runs, name) for name in names), "by validation"]
+        lost = [str(row["diverged"] or "-")] * bool(runs.diverged)
+        best = "best" * row["is_best"]
+        rows.append([*(f"{row[name]:g}" for name in varied), *numbers, *lost, best])
+    header = [*varied, *(_title(runs, name) for name in names)]
+    header += [*["diverged"] * bool(runs.diverged), "by validation"]
     lines = [
         *(f"# {runs.path.name}: {metric.name.lower()}", ""),
         *tables.table(header, rows),
@@ -45,6 +49,11 @@ def as_markdown(runs: Runs) -> str:
         "evaluation of each run in training, by which its checkpoint was chosen; the others are "
         "evaluations on record, by the names of their files.",
     ]
+    if runs.diverged:
+        lines += ["", "Runs that diverged count nowhere and are not evaluated:", ""]
+    for run in runs.diverged:
+        what, _ = CAUSES[run["diverged_by"]]
+        lines.append(f"* {Path(run['path']).name}, by update {run['diverged_at']}. {what} first.")
     return "\n".join(lines) + "\n"
 
 

@@ -10,11 +10,14 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxnew import finiteness
+from jaxnew.finiteness import counts_along
 from jaxnew.policy import PolicyMethod
 from jaxnew.ppo.advantages import gae
 from jaxnew.ppo.config import PPOConfig
 from jaxnew.ppo.objective import Hyperparameters, Minibatch, loss, normalize_advantages
 from jaxnew.rollout.contract import Policy, Rollout, RolloutBatch
+from jaxnew.rollout.frames import FrameHistory
 from jaxnew.sampling import Actions, AvailableSet
 
 Metrics = dict[str, jax.Array]
@@ -118,13 +121,12 @@ class GradientSteps:
 
         indices = self._minibatch_indices(key)
         (params, opt_state), metrics = jax.lax.scan(gradient_step, (params, opt_state), indices)
+        learned = {"loss": metrics["loss/total"], "gradient": metrics["gradient_norm"]}
         nonfinite = {
-            f"nonfinite/{name}": jnp.sum(~jnp.isfinite(values)).astype(jnp.float32)
-            for name, values in {
-                "loss": metrics["loss/total"],
-                "gradient": metrics["gradient_norm"],
-                "advantage": advantages,
-            }.items()
+            **_counts_of(batch),
+            "advantage": finiteness.count(advantages),
+            **finiteness.first({name: counts_along(of) for name, of in learned.items()}),
+            "parameter": finiteness.count(params),
         }
         metrics = jax.tree.map(jnp.mean, metrics)
         residual_variance = jnp.var(value_targets - batch.value)
@@ -132,7 +134,8 @@ class GradientSteps:
             jnp.var(value_targets) + 1e-8
         )
         metrics["learning_rate"] = learning_rate
-        return params, opt_state, {**metrics, **nonfinite}
+        metrics |= {finiteness.PREFIX + name: value for name, value in nonfinite.items()}
+        return params, opt_state, metrics
 
     def _learning_rate_factor(self, step: jax.Array) -> jax.Array:
         """Linear from 1 to 0.1 over `lr_updates`, then constant."""
@@ -174,6 +177,19 @@ class GradientSteps:
             grads, metrics = _mean_over(gradient_of, parts)
         grads_direct, grad_rows = grads
         return jax.tree.map(jnp.add, grads_direct, pull_back(grad_rows)[0]), metrics
+
+
+def _counts_of(batch: RolloutBatch) -> Metrics:
+    """What of a rollout is not finite, at the first step at which anything is not."""
+    seen = batch.observation
+    at_steps = {
+        # Of stacked frames the newest.
+        "observation": seen.frames[-len(batch.done) :] if isinstance(seen, FrameHistory) else seen,
+        "policy": (batch.value, batch.log_prob),
+        "reward": batch.reward,
+    }
+    counts = finiteness.first({name: counts_along(of) for name, of in at_steps.items()})
+    return {**counts, "next_value": finiteness.count(batch.next_value)}
 
 
 def _mean_over(function: Any, parts: Any) -> Any:

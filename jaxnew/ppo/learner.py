@@ -10,6 +10,7 @@ from typing import Any, cast
 import jax
 import jax.numpy as jnp
 
+from jaxnew import finiteness
 from jaxnew.ppo.gradient import GradientSteps, Metrics, TrainState
 from jaxnew.ppo.objective import Hyperparameters
 from jaxnew.rollout.contract import Policy
@@ -58,7 +59,8 @@ class Learner(GradientSteps):
 
         Returns:
           The next state and scalars: `episodes/...` are sums over the episodes that ended,
-          `nonfinite/...` counts, the rest means over the gradient steps. On the host also
+          `nonfinite/...` counts (`jaxnew.finiteness.CAUSES`), the rest means over the gradient
+          steps. On the host also
           `time/rollout_s` and `time/learn_s`, the seconds of the two parts, and those of
           `Rollout.collect`.
         """
@@ -97,7 +99,8 @@ class Learner(GradientSteps):
     ) -> tuple[TrainState, Metrics]:
         """`num_updates` (static) times `update`, and the metrics over all of them.
 
-        `episode/...` are means over the episodes that ended, NaN if none did.
+        `episode/...` are means over the episodes that ended, NaN if none did; `nonfinite/...` are
+        those of the first update that has any.
         """
         if self.rollout.is_traced:
 
@@ -152,10 +155,13 @@ class Learner(GradientSteps):
 def reduce_metrics(stacked: Metrics) -> Metrics:
     """Metrics of several updates, f32[n] each, as one f32[] each; see `Learner.updates`."""
     reduced = {
-        name: jnp.sum(values) if name.startswith("nonfinite/") else jnp.mean(values)
+        name: jnp.mean(values)
         for name, values in stacked.items()
-        if not name.startswith("episodes/")
+        if not name.startswith(("episodes/", finiteness.PREFIX))
     }
+    reduced |= finiteness.first(
+        {name: values for name, values in stacked.items() if name.startswith(finiteness.PREFIX)}
+    )
     num_episodes = jnp.sum(stacked["episodes/num_episodes"])
     for name, values in stacked.items():
         if name.startswith("episodes/") and name != "episodes/num_episodes":

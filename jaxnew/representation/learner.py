@@ -11,6 +11,8 @@ import numpy as np
 import optax
 from flax import struct
 
+from jaxnew import finiteness
+from jaxnew.finiteness import PREFIX
 from jaxnew.representation.batches import Batches, Choice
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
@@ -120,8 +122,8 @@ class RepresentationLearner:
           num_steps: at least 1.
         Returns:
           The new state, and f32[] metrics: means over the steps of `loss`, `reconstruction`,
-          `kl_action`, `kl_observation` and `grad_norm` (before the clamp), and `nonfinite`, the
-          number of non-finite entries of losses and gradients over all steps.
+          `kl_action`, `kl_observation` and `grad_norm` (before the clamp); `nonfinite/...` are
+          the numbers of entries that are not finite at the first step that has any.
         Raises:
           ValueError: see `init`; or `num_steps` < 1, or the recordings do not suit the modality.
         """
@@ -215,13 +217,12 @@ class RepresentationLearner:
         ) -> tuple[RepresentationState, Metrics]:
             state, totals = carry
             state, metrics = self._update(state, recordings)
-            return state, jax.tree.map(jnp.add, totals, metrics)
+            return state, _added(totals, metrics)
 
         shapes = jax.eval_shape(self._update, state, recordings)[1]
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         state, totals = jax.lax.fori_loop(0, num_steps, body, (state, zeros))
-        means = {name: total / num_steps for name, total in totals.items()}
-        return state, {**means, "nonfinite": totals["nonfinite"]}
+        return state, _means(totals, num_steps)
 
     def _update(
         self, state: RepresentationState, recordings: jax.Array
@@ -242,11 +243,10 @@ class RepresentationLearner:
             state, metrics = self._step(state, batch, jnp.int32(shape[0]))
             # One step computes and at most one waits while the next batch is gathered.
             jax.block_until_ready(totals)
-            totals = jax.tree.map(jnp.add, totals, metrics) if totals else metrics
+            totals = _added(totals, metrics) if totals else metrics
             if i + 1 < num_steps:
                 batch = source.gather(rows[i + 1], numbers[i + 1])
-        means = {name: total / num_steps for name, total in totals.items()}
-        return state, {**means, "nonfinite": totals["nonfinite"]}
+        return state, _means(totals, num_steps)
 
     def _choices_of(
         self, state: RepresentationState, shape: tuple[int, ...], num_steps: int
@@ -266,15 +266,15 @@ class RepresentationLearner:
             state.params, state.batch_stats, features, key_noise, weight
         )
         updates, opt_state = self._optimizer.update(grads, state.opt_state, state.params)
-        nonfinite = sum(jnp.sum(~jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, grads)))
         metrics = {
             "loss": loss,
             "reconstruction": terms.reconstruction,
             "kl_action": terms.kl_action,
             "kl_observation": terms.kl_observation,
             "grad_norm": jnp.sqrt(sum(jnp.vdot(leaf, leaf) for leaf in jax.tree.leaves(grads))),
-            "nonfinite": jnp.asarray(nonfinite, jnp.float32),
         }
+        counted = {"recording": features, "loss": loss, "gradient": grads}
+        metrics |= {PREFIX + name: finiteness.count(values) for name, values in counted.items()}
         state = replace(
             state,
             params=optax.apply_updates(state.params, updates),
@@ -339,3 +339,21 @@ class RepresentationLearner:
             variables, self._features(recordings), method="posterior"
         )
         return posterior
+
+
+def _added(totals: Metrics, metrics: Metrics) -> Metrics:
+    """Sums over steps; counts of what is not finite stay those of the first step that has any."""
+    is_first = sum(value for name, value in totals.items() if name.startswith(PREFIX)) == 0
+    return {
+        name: jnp.where(is_first, metrics[name], total)
+        if name.startswith(PREFIX)
+        else total + metrics[name]
+        for name, total in totals.items()
+    }
+
+
+def _means(totals: Metrics, num_steps: int | jax.Array) -> Metrics:
+    return {
+        name: total if name.startswith(PREFIX) else total / num_steps
+        for name, total in totals.items()
+    }

@@ -398,8 +398,17 @@ def _spoiled(name: str, value: float, at: int) -> Any:
     [
         ("loss", float("nan"), "loss is nan at step 20; the checkpoint of step 10 is good"),
         ("loss", float("-inf"), "loss is -inf at step 20"),
-        ("nonfinite/gradient", 3.0, "nonfinite/gradient is 3.0 at step 20"),
-        ("nonfinite/gradient", float("nan"), "nonfinite/gradient is nan at step 20"),
+        (
+            "nonfinite/gradient",
+            3.0,
+            r"The gradient was not .* \(nonfinite/gradient is 3\) at step 20; .* learning rate",
+        ),
+        (
+            "nonfinite/reward",
+            2.0,
+            r"A reward was NaN .* \(nonfinite/reward is 2\) at step 20; .* the environment returns",
+        ),
+        ("nonfinite/gradient", float("nan"), r"nonfinite/gradient is nan\) at step 20"),
         # Nothing in the metrics tells of it: the parameters themselves are looked at.
         ("episode/length", 1.0, "of the state is not finite at step 20"),
     ],

@@ -13,8 +13,10 @@ import jax
 import numpy as np
 import pytest
 
+from experiments.reports.runs import read_runs
+from experiments.reports.sweeps import as_markdown
 from jaxnew import loop
-from jaxnew.ppo import Hyperparameters
+from jaxnew.ppo import Hyperparameters, Learner
 from jaxnew.representation.table import engineered_table
 from jaxnew.run import Run
 from jaxnew.runs import Runs
@@ -148,6 +150,7 @@ def test_rows_are_those_of_the_runs(swept: Runs) -> None:
     for row in swept.table():
         assert set(row) == {
             *("path", "seed", "best_metric", "best_step", "elapsed_s"),
+            *("diverged_at", "diverged_by"),
             *(field.name for field in fields(Hyperparameters)),
         }
         metadata = Checkpointer(Path(row["path"]) / "checkpoints").metadata("best")
@@ -201,10 +204,11 @@ def test_it_is_read_back_as_one_table(swept: Runs, tmp_path: Path) -> None:
     tested = [row[name] for row in runs.table()]
     assert high[name] == pytest.approx(np.mean(tested[2:]))
     assert high[f"{name}_std"] == pytest.approx(np.std(tested[2:]))
-    # A run that diverged counts nowhere, and has no best checkpoint.
-    write_rows(path, [{**rows[0], "best_metric": None}, *rows[1:]])
+    # A run that diverged counts nowhere.
+    write_rows(path, [{**rows[0], "diverged_at": 2, "diverged_by": "loss"}, *rows[1:]])
     runs = Runs.load(path, LADDER)
     low = runs.summary()[0]
+    assert [row["diverged"] for row in runs.summary()] == [1, 0]
     assert (low["best_metric"], low["best_metric_seeds"]) == (0.3, 1)
     assert [run.path.name for run in runs] == [Path(row["path"]).name for row in rows[1:]]
     shared = [run.trainer.learner for run in runs]
@@ -216,6 +220,64 @@ def write_rows(path: Path, rows: list[dict[str, Any]]) -> None:
 
 
 @pytest.mark.integration
+def test_a_member_that_diverges_is_named_and_stopped(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It stays what it was before the chunk, while the other goes on; nothing is played with it."""
+    real = Learner.update
+
+    def spoiled(self: Learner, state: Any, numbers: Any, actions: Any) -> Any:
+        state, metrics = real(self, state, numbers, actions)
+        is_bad = (numbers.clip > 0.4) & (state.step == 4)
+        params = jax.tree.map(lambda x: jax.numpy.where(is_bad, jax.numpy.nan, x), state.params)
+        metrics["nonfinite/reward"] += is_bad
+        return state.replace(params=params), metrics
+
+    monkeypatch.setattr(Learner, "update", spoiled)
+    # The last chunk, of one update, would be a sound one.
+    settings = {"num_updates": 5, "loop.chunk_updates": 2, "loop.evaluate_every": 4}
+    arguments: dict[str, Any] = {"budget": "smoke", "runs": tmp_path, "set": settings}
+    both = sweep(LADDER, TABLE, seeds=[3], vary={"clip": [0.1, 0.5]}, **arguments)
+    output = capsys.readouterr().out
+    assert output.count("clip=0.5-seed=3 diverged by update 4: A reward was NaN") == 1
+    sound, diverged = both.rows
+    assert (diverged["diverged_at"], diverged["diverged_by"]) == (4, "reward")
+    assert sound["diverged_at"] is None
+    assert sound["best_step"] in (4, 5)
+    assert diverged["best_step"] is None  # What it stayed was never evaluated.
+    found = Run.load(diverged["path"], "latest")
+    assert found.step == 2
+    assert Checkpointer(found.path / "checkpoints").steps("latest") == [2]
+    assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(found.policy))
+    with pytest.raises(loop.NonFiniteError, match="diverged by update 4, so that nothing"):
+        found.evaluate(episodes=4)
+    with pytest.raises(loop.NonFiniteError, match="by update 4, before its first evaluation"):
+        Run.load(diverged["path"])
+    best = both.best()
+    assert best.path == Path(sound["path"])
+    nan = best.acting_as(jax.tree.map(lambda x: x * np.nan, best.policy), "nan")
+    with pytest.raises(loop.NonFiniteError, match=r"Parameters of .*, nan, are not finite"):
+        nan.play()
+    assert [run.path for run in both.load_each("latest")] == [Path(sound["path"])]
+    assert max(line["step"] for line in read(diverged["path"])) == 4
+    assert "clip=0.5-seed=3, by update 4. A reward was NaN" in as_markdown(both)
+    assert [record.path.name for record in read_runs([both.path])] == ["clip=0.1-seed=3"]
+
+
+@pytest.mark.unit
+def test_a_sweep_ends_where_every_member_diverged(
+    base: TrainConfig, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trainer: Any = None
+    program = SweepProgram.of(trainer, member_configs(base, [1, 2], {}), jax.devices()[:1])
+    stopped: Any = SimpleNamespace(members=SimpleNamespace(step=np.array([2, 1])))
+    counts = {"nonfinite/loss": np.array([1.0, 0.0]), "nonfinite/gradient": np.array([4.0, 0.0])}
+    with pytest.raises(loop.NonFiniteError, match="All 2 members diverged, the last by update 3"):
+        program._tell_diverged(stopped, np.array([True, False]), counts, 3)
+    assert "seed=1 diverged by update 3: The loss was not finite first." in capsys.readouterr().out
+
+
+@pytest.mark.integration
 def test_older_sweeps_are_read_and_left_alone(swept: Runs, tmp_path: Path) -> None:
     """Members were numbered, and rows had them by name, with hyper-parameters as a group."""
     path = tmp_path / "old"
@@ -223,8 +285,10 @@ def test_older_sweeps_are_read_and_left_alone(swept: Runs, tmp_path: Path) -> No
     numbers = {field.name for field in fields(Hyperparameters)}
     rows = []
     for index, row in enumerate(swept.rows):
+        assert row["diverged_at"] is None
         (path / "members" / Path(row["path"]).name).rename(path / "members" / f"{index:03d}")
-        rest = {name: row[name] for name in row if name not in {"path", *numbers}}
+        since = {"path", "diverged_at", "diverged_by", *numbers}
+        rest = {name: row[name] for name in row if name not in since}
         own = {name: row[name] for name in numbers}
         rows.append({"member": f"{index:03d}", **rest, "hyperparameters": own})
     write_rows(path, rows)

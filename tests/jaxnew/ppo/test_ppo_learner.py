@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnew.finiteness import cause_of
 from jaxnew.policy import make_method
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig, TrainState
 from jaxnew.ppo.learner import reduce_metrics
@@ -243,8 +244,18 @@ def test_learning_rate_schedule(
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("broken", ["reward", "log_prob", "params"])
-def test_nonfinite_numbers_are_counted(params: Any, broken: str) -> None:
+@pytest.mark.parametrize(
+    ("broken", "cause"),
+    [
+        ("observation", "observation"),
+        ("reward", "reward"),
+        ("log_prob", "policy"),
+        ("next_value", "next_value"),
+        ("params", "loss"),
+    ],
+)
+def test_nonfinite_numbers_are_counted(params: Any, broken: str, cause: str) -> None:
+    """And the first of them is named."""
     data = batch_of(params, seed=5, value_scale=1.0)
     if broken != "params":
         data[broken][T - 1, 2] = np.nan
@@ -263,10 +274,11 @@ def test_nonfinite_numbers_are_counted(params: Any, broken: str) -> None:
     )
     assert metrics["nonfinite/loss"] >= 1
     assert metrics["nonfinite/gradient"] >= 1
+    assert cause_of(metrics) == cause
     if broken == "reward":
         # One that spreads to what came before it in its episode, and no further.
         assert 1 <= metrics["nonfinite/advantage"] <= T
-    else:
+    elif broken != "next_value":
         assert metrics["nonfinite/advantage"] == 0
 
 
@@ -440,13 +452,15 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
 def test_metrics_of_several_updates_are_reduced() -> None:
     stacked = {
         "loss/total": jnp.array([1.0, 3.0]),
-        "nonfinite/loss": jnp.array([0.0, 2.0]),
+        "nonfinite/loss": jnp.array([0.0, 2.0, 5.0]),
+        "nonfinite/reward": jnp.array([0.0, 0.0, 1.0]),
         "episodes/num_episodes": jnp.array([3.0, 1.0]),
         "episodes/is_success": jnp.array([2.0, 1.0]),
     }
     assert {name: float(x) for name, x in reduce_metrics(stacked).items()} == {
         "loss/total": 2.0,
-        "nonfinite/loss": 2.0,
+        "nonfinite/loss": 2.0,  # Of the first update that has any: rewards came later.
+        "nonfinite/reward": 0.0,
         "num_episodes": 4.0,
         "episode/is_success": 0.75,  # 3 of 4 episodes, not the mean of 2/3 and 1.
     }

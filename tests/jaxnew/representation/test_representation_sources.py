@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxnew.finiteness import cause_of
 from jaxnew.representation import learner
 from jaxnew.representation.modality import vector_modality
 from jaxnew.representation.sources import (
@@ -127,11 +128,13 @@ def test_metrics_are_means_and_non_finite_numbers_are_counted(tiny):
         singles.append(float(metrics["loss"]))
     _, metrics = stage1.train_steps(start, source, 3)
     np.testing.assert_allclose(metrics["loss"], np.mean(singles), rtol=1e-6)
-    assert float(metrics["nonfinite"]) == 0.0
+    assert cause_of(metrics) is None
     params = jax.tree.map(lambda leaf: leaf, start.params)
     params["decoder"]["write"]["bias"] = jnp.full_like(params["decoder"]["write"]["bias"], np.nan)
     _, metrics = stage1.train_steps(start.replace(params=params), source, 3)
-    assert float(metrics["nonfinite"]) >= 3.0  # Counted, not averaged.
+    # Those of the first step, counted, not averaged.
+    assert float(metrics["nonfinite/loss"]) == 1.0
+    assert cause_of(metrics) == "loss"
 
 
 @pytest.mark.unit
