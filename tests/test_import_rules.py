@@ -21,12 +21,13 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # Layers of `jaxnew`, lowest first. A module may import lower layers; within one layer, only along
 # `SIDEWAYS`. Files, metrics, configs and the like know nothing of what is learned.
 LAYERS = (
-    {"actions", "cores", "storage", "observations", "collection"},
+    {"actions", "cores", "host_checks", "storage", "observations", "collection"},
     {"sampling", "environment", "convolution"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
+    {"checks"},
     {"recording", "embedding", "trainer", "new_actions", "run", "runs", "training", "sweeping"},
 )
 SIDEWAYS = {
@@ -56,6 +57,7 @@ HOST_MAY_IMPORT = {
     "PIL",
     "jaxnew.actions",
     "jaxnew.cores",
+    "jaxnew.host_checks",
 }
 
 
