@@ -27,6 +27,7 @@ from envs_host.channel import Channel, HungUp
 from envs_host.memory import Failure, Format, Restore, Setup, SharedArrays, episode_key
 from envs_host.protocol import HostEnvironment, load_factory
 from jaxnew.cores import signal_at_parents_end
+from jaxnew.host_checks import checked_observation, checked_step
 
 # A worker in the middle of a step gets this long to finish once the pool's process is gone.
 GRACE_S = 1.0
@@ -64,9 +65,6 @@ class Host:
                 self._environments[i] = make(**self._setup.kwargs)
         self.environment = None
         self.format = self._common_format()
-        self._shape = self.format.observation_shape
-        self._dtype = np.dtype(self.format.observation_dtype)
-        self._metric_names = frozenset(self.format.episode_metrics)
 
     def _common_format(self) -> Format:
         formats = {i: _format_of(env) for i, env in self._environments.items()}
@@ -92,8 +90,8 @@ class Host:
             self.environment = i
             observation = self._reset(i, int(self._arrays.episodes[i]))
             for t, (action_id, position) in enumerate(zip(ids.tolist(), positions, strict=True)):
-                observation, _, terminated, truncated, _ = self._environments[i].step(
-                    action_id, position.copy()
+                observation, _, terminated, truncated, _ = self._stepped(
+                    i, action_id, position.copy()
                 )
                 if terminated or truncated:
                     raise ProtocolError(
@@ -102,7 +100,7 @@ class Host:
                         "actions alone, or it has changed."
                     )
                 tell_progress()
-            self._arrays.observations[i] = self._checked(observation)
+            self._arrays.observations[i] = observation
             tell_progress()
         self.environment = None
 
@@ -117,21 +115,16 @@ class Host:
         )
         for i, (action_id, position) in enumerate(actions, first):
             self.environment = i
-            observation, reward, terminated, truncated, metrics = self._environments[i].step(
-                action_id, position
+            observation, reward, terminated, truncated, metrics = self._stepped(
+                i, action_id, position
             )
-            observation = self._checked(observation)
             arrays.final_observations[i] = observation
-            if metrics.keys() != self._metric_names:
-                raise ProtocolError(
-                    f"The metrics of a step are {sorted(metrics)}; episode_metrics says {names}."
-                )
-            rewards.append(float(reward))
-            terminations.append(bool(terminated))
-            truncations.append(bool(truncated))
+            rewards.append(reward)
+            terminations.append(terminated)
+            truncations.append(truncated)
             rows.append([float(metrics[name]) for name in names])
             if terminated or truncated:
-                observation = self._checked(self._reset(i, int(arrays.episodes[i]) + 1))
+                observation = self._reset(i, int(arrays.episodes[i]) + 1)
             arrays.observations[i] = observation
         self.environment = None
         arrays.rewards[first:end] = rewards
@@ -139,29 +132,36 @@ class Host:
         arrays.truncated[first:end] = truncations
         arrays.metrics[first:end] = rows
 
-    def _reset(self, i: int, episode: int) -> Any:
+    def _reset(self, i: int, episode: int) -> np.ndarray:
         key = episode_key(i, episode, self._setup.num_envs, self._is_numbered)
-        return self._environments[i].reset(np.random.SeedSequence(self._seed, spawn_key=key))
+        env = self._environments[i]
+        observation = env.reset(np.random.SeedSequence(self._seed, spawn_key=key))
+        with _promises():
+            # Assigning one of another shape would broadcast, of another dtype cast.
+            return checked_observation(f"{type(env).__name__}.reset", env, observation)
 
-    def _checked(self, observation: Any) -> np.ndarray:
-        """The observation; assigning one of another shape would broadcast, of another dtype cast.
-
-        Raises:
-          ProtocolError: it is not what the environment declares.
-        """
-        array = np.asarray(observation)
-        if array.shape != self._shape or array.dtype != self._dtype:
-            raise ProtocolError(
-                f"An observation is {array.dtype}{list(array.shape)}; the environment declares "
-                f"{self._dtype}{list(self._shape)}."
-            )
-        return array
+    def _stepped(self, i: int, action_id: int, position: np.ndarray) -> tuple[Any, ...]:
+        """Steps an environment; the five parts of `protocol.Step`, checked."""
+        env = self._environments[i]
+        step, what = env.step(action_id, position), f"{type(env).__name__}.step"
+        with _promises():
+            observation, *rest = checked_step(what, step, self.format.episode_metrics)
+            return checked_observation(what, env, observation), *rest
 
     def close(self) -> None:
         for env in self._environments.values():
             close = getattr(env, "close", None)
             if close is not None:
                 close()
+
+
+@contextlib.contextmanager
+def _promises() -> Iterator[None]:
+    """What is wrong with what an environment gave is wrong with the environment."""
+    try:
+        yield
+    except ValueError as err:
+        raise ProtocolError(str(err)) from None
 
 
 def _format_of(env: HostEnvironment) -> Format:
@@ -214,7 +214,9 @@ def _exceptions_told(channel: Channel, host: Host) -> Iterator[None]:
     except HungUp:
         raise
     except BaseException as err:
-        failure = Failure(host.environment, host.activity, traceback.format_exc())
+        # A broken promise is told in a sentence; where it was found says nothing more.
+        told = f"{err}" if isinstance(err, ProtocolError) else traceback.format_exc()
+        failure = Failure(host.environment, host.activity, told)
         channel.send(codes.FAILED, failure)
         raise SystemExit(1) from err
 

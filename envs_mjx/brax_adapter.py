@@ -1,12 +1,11 @@
-"""Any environment of the house as a Brax environment, and Brax's page of moving bodies.
+"""Any environment of the house as a Brax environment.
 
 The one module that imports Brax (0.14), which takes seconds: import it by its own name.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -20,7 +19,6 @@ from jaxnew.environment import Action, Environment, checked_ids
 
 try:
     from brax.envs.base import Env, State
-    from brax.io import html
 except ImportError as err:
     raise ImportError(
         "envs_mjx.brax_adapter needs Brax, which cannot be imported; install it: "
@@ -207,16 +205,3 @@ def _replicated(tree: Any, devices: Sequence[jax.Device]) -> Any:
     sharding = jax.sharding.NamedSharding(mesh, jax.sharding.PartitionSpec("device"))
     copies = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * len(devices)), tree)
     return jax.device_put(copies, sharding)
-
-
-def render_page(system: Mapping[str, Any]) -> str:
-    """Brax's interactive page of moving bodies, as HTML that fills the browser's window.
-
-    The numbers are inside the page. The program that draws them is not: the browser loads Brax's
-    viewer, three.js, lil-gui and pako from the content networks unpkg.com and cdn.jsdelivr.net.
-
-    Args:
-      system: as `brax.io.json.dumps` writes it: `opt.timestep` s between frames, `geoms` by the
-        name of their body, `states.x` with `pos` and `rot` of all bodies in each frame.
-    """
-    return html.render_from_json(json.dumps(system), height=None, colab=False, base_url=None)

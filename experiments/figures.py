@@ -92,7 +92,7 @@ ARGUMENTS.define(
 ARGUMENTS.define(
     "enum", "film_format", "gif", "Of their files; mp4: jaxnew[video].", choices=["gif", "mp4"]
 )
-ARGUMENTS.define("bool", "film_pages", False, "Interactive pages as well, of stacking; needs Brax.")
+ARGUMENTS.define("bool", "film_pages", False, "Interactive pages as well, of stacking.")
 
 # Flags that only some kinds of figures use.
 _FILMS = ("films", "film_size", "film_format", "film_pages")

@@ -41,6 +41,8 @@ _HOMES = {
     "Runs": "jaxnew.runs",
     "Task": "jaxnew.task.task",
     "Trainer": "jaxnew.trainer",
+    "check_environment": "jaxnew.checks",
+    "check_method": "jaxnew.checks",
     "collect": "jaxnew.recording",
     "draw_sets": "jaxnew.sampling",
     "embed": "jaxnew.embedding",

@@ -20,6 +20,7 @@ import numpy as np
 from flax import struct
 
 from jaxnew import loop
+from jaxnew.checks import check_run
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.finiteness import CAUSES, PREFIX, cause_of
 from jaxnew.ppo import Hyperparameters, TrainState
@@ -301,6 +302,7 @@ def sweep(
     base = with_set(train_config(domain, method, name, found, preset, listed[0]), set)
     configs = member_configs(base, listed, vary or {})
     trainer = Trainer.of(configs[0], task, domain.split, found)
+    check_run(task, trainer.rollout, configs[0].method, np.asarray(trainer.training.table))
     program = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
     members = [identity(config) for config in configs]
     words = ["sweep", file_name(method), Path(name).stem]

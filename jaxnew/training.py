@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import jax
+import numpy as np
 
 from jaxnew import loop
 from jaxnew.actions import ActionSplit, check_same
+from jaxnew.checks import check_run
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table, is_learned
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
@@ -83,13 +85,12 @@ def train(
     title = f"{file_name(method)}-{Path(name).name.removesuffix('.npz')}"
     path = domain.folder(runs) / f"{title}-{domain.split_label}-{budget}-{seed}"
     path = Path(workdir) if workdir else path
-    with (
-        Trainer.of(config, task, domain.split, found, num_workers) as trainer,
-        open_run(path, trainer, overwrite) as directory,
-    ):
-        cost = foretold(preset, config)
-        print(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
-        result = run_updates(trainer, trainer.init(), directory, title, is_evaluated=True)
+    with Trainer.of(config, task, domain.split, found, num_workers) as trainer:
+        check_run(task, trainer.rollout, config.method, np.asarray(trainer.training.table))
+        with open_run(path, trainer, overwrite) as directory:
+            cost = foretold(preset, config)
+            print(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
+            result = run_updates(trainer, trainer.init(), directory, title, is_evaluated=True)
     if result.best_metric is not None:
         print(
             f"{path}: update {result.step} of {config.num_updates}; best "

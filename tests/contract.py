@@ -7,7 +7,8 @@ whole list costs one or two compiles:
   contract.check_observations(env, env.default_params, rollout)
   contract.check_rewards(rollout, low=0.0, high=1.0)
 
-Each check raises `AssertionError` and names what was broken.
+Each check raises `AssertionError`, or the `UsageError` of `jaxnew.checks`, and says what broke.
+Trees, shapes and dtypes are the business of `jaxnew.checks.check_forms`.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxnew.checks import check_values
 from jaxnew.environment import Action, Environment, FixedActionSet
 
 SampleAction = Callable[[jax.Array, Environment], Action]
@@ -136,27 +138,6 @@ def check_traces_once(env: Environment, params: Any, other_params: Any, num_envs
     assert num_traces == {"reset": 1, "step": 1}, num_traces
 
 
-def check_trees_match(env: Environment, params: Any) -> None:
-    """Reset and step agree on trees, shapes and dtypes, and flags and reward are scalars."""
-    key = jax.random.key(0)
-    action = jax.eval_shape(lambda key: sample_uniform(key, env), key)
-    reset_shapes = jax.eval_shape(env.reset, key, params)
-    step_shapes = jax.eval_shape(env.step, key, reset_shapes[1], action, params)
-    _, _, reward, terminated, truncated, info = step_shapes
-    assert jax.tree.structure(reset_shapes) == jax.tree.structure(step_shapes[:2])
-    for first, later in zip(*map(jax.tree.leaves, (reset_shapes, step_shapes[:2])), strict=True):
-        assert (first.shape, first.dtype) == (later.shape, later.dtype), (first, later)
-        assert not first.weak_type, f"{first} is weakly typed: it would not scan."
-        assert not later.weak_type, f"{later} is weakly typed: it would not scan."
-    assert (reward.shape, reward.dtype) == ((), jnp.float32), reward
-    assert (terminated.shape, terminated.dtype) == ((), jnp.bool_), terminated
-    assert (truncated.shape, truncated.dtype) == ((), jnp.bool_), truncated
-    final = info["final_observation"]
-    assert (final.shape, final.dtype) == (reset_shapes[0].shape, reset_shapes[0].dtype), final
-    raw_info = jax.eval_shape(env.step_env, key, reset_shapes[1], action, params)[-1]
-    assert set(info) == set(raw_info) | {"final_observation"}, (set(info), set(raw_info))
-
-
 def check_observations(env: Environment, params: Any, rollout: Rollout) -> None:
     """Every observation has the declared shape and dtype, is finite and within the bounds."""
     spec = env.observation_spec(params)
@@ -164,9 +145,7 @@ def check_observations(env: Environment, params: Any, rollout: Rollout) -> None:
         obs = getattr(rollout, name)
         assert obs.shape[-len(spec.shape) :] == spec.shape, (name, obs.shape, spec.shape)
         assert obs.dtype == np.dtype(spec.dtype), (name, obs.dtype, spec.dtype)
-        assert np.isfinite(obs.astype(np.float64)).all(), f"{name} is not finite."
-        assert obs.min() >= spec.low, f"{name}: {obs.min()} is below the bound {spec.low}."
-        assert obs.max() <= spec.high, f"{name}: {obs.max()} is above the bound {spec.high}."
+        check_values(name, spec, obs)
 
 
 def check_constant_elements(env: Environment, params: Any, rollout: Rollout) -> None:

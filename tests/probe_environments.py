@@ -84,6 +84,7 @@ class TableWorld(Environment[TableState, TableParams]):
             "is_success": reward > 0,
             "episode_return": state.episode_return,
             "final_state": state.state,
+            "invalid_action": (action.id < 0) | (action.id >= self._num_actions),
         }
         return params.observations[state.state], state, reward, terminated, truncated, info
 

@@ -22,12 +22,13 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # `SIDEWAYS`, which names parts, or modules of them. Files, metrics, configs and the like know
 # nothing of what is learned.
 LAYERS = (
-    {"actions", "cores", "storage", "observations", "collection"},
+    {"actions", "cores", "host_checks", "storage", "observations", "collection"},
     {"sampling", "environment", "convolution", "finiteness"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
+    {"checks"},
     {"recording", "embedding", "trainer", "new_actions", "run", "runs", "training", "sweeping"},
 )
 SIDEWAYS = {
@@ -58,6 +59,7 @@ HOST_MAY_IMPORT = {
     "PIL",
     "jaxnew.actions",
     "jaxnew.cores",
+    "jaxnew.host_checks",
 }
 
 

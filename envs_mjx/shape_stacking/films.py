@@ -53,11 +53,8 @@ def page(shown: Sequence[Bodies], shapes: tuple[Shape, ...] = ()) -> str:
     Args:
       shown: the moments.
       shapes: of the user's own, as the environment has them.
-
-    Raises:
-      ImportError: Brax is missing.
     """
-    from envs_mjx.shape_stacking.viewer import tower_html  # Imports Brax.
+    from envs_mjx.shape_stacking.viewer import tower_html  # Nothing else here needs trimesh.
 
     poses = np.stack([np.asarray(bodies.qpos) for bodies in shown])
     return tower_html(shown[-1].shape_ids, poses, FRAME_STEPS * scene.TIMESTEP_S, shapes)

@@ -1,28 +1,75 @@
-"""An interactive page of a tower: Brax's viewer with the shapes of the library.
+"""An interactive page of a tower: it needs a browser and nothing else, no network either.
 
-Lengths are metres. Imports Brax, by its adapter.
+Lengths are metres. The page is trimesh's, which holds three.js, and a script that moves the bodies.
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from typing import Any
 
 import jax
 import numpy as np
+import trimesh
+from trimesh.viewer.notebook import scene_to_html
 
-from envs_mjx import brax_adapter
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.camera import TABLE_COLOR, TABLE_HALF_SIZES
 from envs_mjx.shape_stacking.shapes import Shape, shape_library
 from envs_mjx.shape_stacking.solids import ARCH_OPENING_RADIUS, CLASS_NAMES, solids
 
-# Where a body waits for its first frame: above its first place, beyond the viewer's fog (60 m).
-WAITING_HEIGHT = 70.0
-
+_TABLE = "table"
+_TABLE_THICKNESS = 0.05
+_SECTIONS = 48  # Of round shapes.
 _ARCH_SEGMENTS = 32
 
-Geom = dict[str, Any]
+# `THREE`, `scene`, `camera`, `controls`, `tracklight` and `render` are those of trimesh's page. It
+# reads the bodies in the background. There is a slider, which moves until it is touched.
+_SCRIPT = """
+<input id="time" type="range" min="0" step="any" value="0"
+ style="position: fixed; bottom: 1em; left: 5%%; width: 90%%">
+<script>
+const film = %s;
+const slider = document.getElementById("time"), end = film.times[film.times.length - 1];
+slider.max = end;
+let isPlaying = end > 0, time = 0, before = performance.now();
+tracklight.intensity = 0.5;
+const sky = new THREE.HemisphereLight(0xffffff, 0x888888, 0.6);
+sky.position.set(0, 0, 1);
+scene.add(sky);
+slider.addEventListener("pointerdown", () => { isPlaying = false; });
+const bodies = [];
+function show(now) {
+  time = (time + (now - before) / 1000) %% (end + 2);  // The tower is seen for 2 s.
+  if (isPlaying) slider.value = time;
+  before = now;
+  const shown = Number(slider.value);
+  for (const body of bodies) {
+    body.node.visible = shown >= body.from;
+    body.node.position.fromArray(body.positions.evaluate(shown));
+    body.node.quaternion.fromArray(body.rotations.evaluate(shown));
+  }
+  render();
+  requestAnimationFrame(show);
+}
+function begin() {
+  scene.traverse((node) => {
+    const body = film.bodies[node.userData.name];
+    if (!body) return;
+    const positions = new THREE.VectorKeyframeTrack("p", film.times, body.positions);
+    const rotations = new THREE.QuaternionKeyframeTrack("q", film.times, body.rotations);
+    bodies.push({node: node, from: body.from,
+      positions: positions.createInterpolant(), rotations: rotations.createInterpolant()});
+  });
+  if (!bodies.length) return setTimeout(begin, 50);
+  camera.up.set(0, 0, 1);
+  camera.position.set(2, -6, 1.5);
+  controls.target.set(0, 0, 0.3);
+  requestAnimationFrame(show);
+}
+begin();
+</script>
+"""
 
 
 def tower_html(
@@ -35,8 +82,8 @@ def tower_html(
 
     Bodies are drawn as they collide in MuJoCo's C engine: spheres, capsules and cylinders as such,
     all others as the flat-sided hulls of the library. Only the arch, whose hull is a full box, is
-    drawn with its opening, as in the agent's images. Between frames the viewer moves bodies evenly.
-    A body that still waits for its turn comes down from the sky within one frame.
+    drawn with its opening, as in the agent's images. Between frames bodies move evenly; one that
+    still waits for its turn is not seen.
 
     Args:
       shape_ids: int32[12] shape of each body at the end, below 0 for unused ones: the last
@@ -47,7 +94,7 @@ def tower_html(
       shapes: of the user's own, with ids from 810.
 
     Returns:
-      HTML text, to be written to a file. See `brax_adapter.render_page` for what it loads.
+      HTML text, to be written to a file; 0.7 MB are three.js.
 
     Raises:
       ValueError: arrays that do not fit together or are not finite, unknown ids, no body at all, or
@@ -55,44 +102,46 @@ def tower_html(
     """
     shape_ids, qpos = np.asarray(shape_ids), np.asarray(qpos)
     _check(shape_ids, qpos, seconds_per_frame, len(shape_library(shapes).s))
-    slots = np.flatnonzero(shape_ids >= 0)
-    geoms: dict[str, list[Geom]] = {"world": [_table()]}
-    for link, slot in enumerate(slots):
-        geom = body_geom(int(shape_ids[slot]), shapes) | {"link_idx": link}
-        geoms[_body_name(int(slot), int(shape_ids[slot]), shapes)] = [geom]
-    poses = np.stack([_with_waiting(int(slot), qpos[:, slot]) for slot in slots], axis=1)
-    frames = [{"pos": p[:, :3].tolist(), "rot": p[:, 3:].tolist()} for p in poses]
-    return brax_adapter.render_page(
-        {"opt": {"timestep": float(seconds_per_frame)}, "geoms": geoms, "states": {"x": frames}}
-    )
+    times = (seconds_per_frame * np.arange(len(qpos))).tolist()
+    world, bodies = trimesh.Scene(), {}
+    world.add_geometry(_table(), node_name=_TABLE, geom_name=_TABLE)
+    for slot in np.flatnonzero(shape_ids >= 0).tolist():
+        name = _body_name(slot, int(shape_ids[slot]), shapes)
+        poses = qpos[:, slot].astype(np.float64)
+        first = int(np.argmin((poses == scene.parked_qpos()[slot]).all(axis=-1)))
+        poses[:first] = poses[first]
+        mesh = body_mesh(int(shape_ids[slot]), shapes)
+        world.add_geometry(mesh, node_name=name, geom_name=name, transform=_matrix(poses[-1]))
+        bodies[name] = {
+            "from": times[first],
+            "positions": poses[:, :3].ravel().tolist(),
+            "rotations": poses[:, [4, 5, 6, 3]].ravel().tolist(),
+        }
+    # Where it stands is the script's business; unnamed ones get names by chance.
+    world.camera = trimesh.scene.Camera("camera", fov=(60.0, 45.0))
+    film = json.dumps({"times": times, "bodies": bodies})
+    return scene_to_html(world).replace("</body>", _SCRIPT % film + "</body>")
 
 
-def body_geom(shape_id: int, shapes: tuple[Shape, ...] = ()) -> Geom:
-    """What the viewer draws for a shape, in the axes of its body.
+def body_mesh(shape_id: int, shapes: tuple[Shape, ...] = ()) -> trimesh.Trimesh:
+    """What is drawn for a shape, in the axes of its body and in its colour.
 
     Args:
       shape_id: of the library.
       shapes: of the user's own, with ids from 810.
-
-    Returns:
-      Brax's entry of a geometry without `link_idx`: `name` (`Sphere`, `Capsule`, `Cylinder` or
-      `Mesh`), `pos`, `rot` (w, x, y, z), `rgba`, `size` (radius, half-length) and, of meshes,
-      `vert` [n, 3] and `face` [m, 3], counter-clockwise seen from outside.
     """
     all_forms, form_of = scene.forms(shapes)
     form = all_forms[form_of[shape_id]]
-    color = shape_library(shapes).color[shape_id]
-    geom: Geom = {
-        "name": form.kind.capitalize(),
-        "pos": [0.0, 0.0, 0.0],
-        "rot": [1.0, 0.0, 0.0, 0.0],
-        "rgba": [*color.tolist(), 1.0],
-        # Radius 1 and half-length 1 at s = 1.
-        "size": [form.s, 0.0 if form.kind == "sphere" else form.s, 0.0],
-    }
-    if form.kind == "mesh":
-        geom |= _mesh([form.s * polygon for polygon in _polygons(form.class_label)])
-    return geom
+    s = form.s  # Radius 1 and half-length 1 at s = 1.
+    if form.kind == "sphere":
+        mesh = trimesh.creation.icosphere(subdivisions=3, radius=s)
+    elif form.kind == "capsule":
+        mesh = trimesh.creation.capsule(height=2.0 * s, radius=s, count=(_SECTIONS, _SECTIONS // 2))
+    elif form.kind == "cylinder":
+        mesh = trimesh.creation.cylinder(radius=s, height=2.0 * s, sections=_SECTIONS)
+    else:
+        mesh = _mesh([s * polygon for polygon in _polygons(form.class_label)])
+    return _painted(mesh, shape_library(shapes).color[shape_id])
 
 
 def _check(
@@ -118,30 +167,32 @@ def _check(
 
 
 def _body_name(slot: int, shape_id: int, shapes: tuple[Shape, ...]) -> str:
-    """Such as `02_cube_690`: the viewer lists bodies by it, and allows no blanks and no dots."""
+    """Such as `02_cube_690`: by it the script finds a body."""
     return f"{slot:02d}_{CLASS_NAMES[shape_library(shapes).class_labels[shape_id]]}_{shape_id}"
 
 
-def _table() -> Geom:
-    """The viewer's planes have whole sizes (MuJoCo's: half), and show their upper face only."""
+def _table() -> trimesh.Trimesh:
     x, y = TABLE_HALF_SIZES
-    return {
-        "name": "Plane",
-        "link_idx": -1,
-        "pos": [0.0, 0.0, scene.TABLE_HEIGHT],
-        "rot": [1.0, 0.0, 0.0, 0.0],
-        "rgba": [*[TABLE_COLOR] * 3, 1.0],
-        "size": [2.0 * x, 2.0 * y, 1.0],
-    }
+    mesh = trimesh.creation.box((2.0 * x, 2.0 * y, _TABLE_THICKNESS))
+    mesh.apply_translation((0.0, 0.0, scene.TABLE_HEIGHT - _TABLE_THICKNESS / 2.0))
+    return _painted(mesh, [TABLE_COLOR] * 3)
 
 
-def _with_waiting(slot: int, poses: np.ndarray) -> np.ndarray:
-    """f64[T, 7] poses of a body, with those at its parking place put above its first other one."""
-    is_waiting = (poses == scene.parked_qpos()[slot]).all(axis=-1)
-    poses = poses.astype(np.float64)
-    first = poses[np.argmin(is_waiting)].copy()
-    first[2] += WAITING_HEIGHT
-    return np.where(is_waiting[:, None], first, poses)
+def _painted(mesh: trimesh.Trimesh, color: Sequence[float] | np.ndarray) -> trimesh.Trimesh:
+    material = trimesh.visual.material.PBRMaterial(
+        baseColorFactor=[*np.round(255.0 * np.asarray(color)).astype(np.uint8).tolist(), 255],
+        metallicFactor=0.0,
+        roughnessFactor=1.0,
+    )
+    mesh.visual = trimesh.visual.TextureVisuals(material=material)
+    return mesh
+
+
+def _matrix(pose: np.ndarray) -> np.ndarray:
+    """f64[4, 4] of a position and a quaternion (w, x, y, z), f64[7]."""
+    matrix = trimesh.transformations.quaternion_matrix(pose[3:])
+    matrix[:3, 3] = pose[:3]
+    return np.asarray(matrix)
 
 
 def _polygons(class_label: int) -> list[np.ndarray]:
@@ -181,12 +232,12 @@ def _arch() -> list[np.ndarray]:
     return faces
 
 
-def _mesh(polygons: Sequence[np.ndarray]) -> Geom:
-    """Triangles of convex polygons. They share no corner, so that the viewer keeps the edges."""
+def _mesh(polygons: Sequence[np.ndarray]) -> trimesh.Trimesh:
+    """Triangles of convex polygons. They share no corner, so that the edges are seen."""
     starts = np.cumsum([0, *map(len, polygons)])
     faces = [
         [int(start), int(start) + i, int(start) + i + 1]
         for start, polygon in zip(starts, polygons, strict=False)
         for i in range(1, len(polygon) - 1)
     ]
-    return {"vert": np.concatenate(polygons).tolist(), "face": faces}
+    return trimesh.Trimesh(np.concatenate(polygons), faces, process=False)

@@ -110,7 +110,7 @@ def load_task(name: str) -> Task:
     Raises:
       UsageError: there is no such module or object, or it is not a `Task`.
     """
-    known = {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
+    known = _installed()
     allowed = f"Tasks: {', '.join(sorted(known))}; or give package.module:TASK for one of your own."
     if ":" in name:
         return _checked(load_place(name, f"task {name!r}", allowed), name, allowed, place=name)
@@ -125,6 +125,15 @@ def load_task(name: str) -> Task:
         listed = ", ".join([base, *(f"{base}-{key}" for key in tasks)])
         raise UsageError(f"Unknown task {name!r}: there are {listed}.")
     return _checked(tasks[variant], name, allowed)
+
+
+def is_installed(task: Task) -> bool:
+    """Whether an installed package brings the task, or the one whose variant it is."""
+    return task.place is None and task.name.partition("-")[0] in _installed()
+
+
+def _installed() -> dict[str, importlib.metadata.EntryPoint]:
+    return {point.name: point for point in importlib.metadata.entry_points(group=ENTRY_POINTS)}
 
 
 def _checked(task: Any, name: str, allowed: str, place: str | None = None) -> Task:

@@ -56,7 +56,7 @@ _ALLOWED = (
     "or class that takes a jaxnew.policy.method.MethodContext and makes a PolicyMethod."
 )
 # What a policy must have, read off the protocol.
-_MEMBERS = [n for n in (*PolicyMethod.__annotations__, *vars(PolicyMethod)) if n[0] != "_"]
+MEMBERS = [n for n in (*PolicyMethod.__annotations__, *vars(PolicyMethod)) if n[0] != "_"]
 
 
 def variant_of(name: str) -> Variant:
@@ -148,10 +148,10 @@ def method_of(
     if ":" not in policy:
         return make_method(policy, context)
     method = load_method(policy)(context)
-    lacking = [member for member in _MEMBERS if not hasattr(method, member)]
+    lacking = [member for member in MEMBERS if not hasattr(method, member)]
     if lacking:
         raise UsageError(
             f"{policy} made {method!r}, which lacks {', '.join(lacking)}. A policy needs "
-            f"{', '.join(_MEMBERS)}; see jaxnew.policy.PolicyMethod."
+            f"{', '.join(MEMBERS)}; see jaxnew.policy.PolicyMethod."
         )
     return method

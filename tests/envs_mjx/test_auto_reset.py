@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from flax import struct
 
+from jaxnew.checks import check_forms
 from jaxnew.environment import (
     Action,
     ActionSpec,
@@ -19,6 +20,7 @@ from jaxnew.environment import (
     ObservationSpec,
     Transition,
 )
+from jaxnew.task.places import UsageError
 from tests import contract
 
 pytestmark = pytest.mark.contract
@@ -56,6 +58,9 @@ class Ends(Environment[EndsState, EndsParams]):
 
     def observation_spec(self, params: EndsParams) -> ObservationSpec:
         return ObservationSpec((2,), jnp.float32, 0.0, 100.0)
+
+    def max_episode_steps(self, params: EndsParams) -> int:
+        return 100
 
     def reset_env(self, key: jax.Array, params: EndsParams) -> tuple[jax.Array, EndsState]:
         state = EndsState(jnp.int32(0), jax.random.uniform(key))
@@ -109,7 +114,7 @@ def rollout(run) -> contract.Rollout:
 def test_checks_pass_on_a_sound_environment(run, rollout) -> None:
     env, params = Ends(), EndsParams()
     contract.check_traces_once(env, params, EndsParams(scale=2.0))
-    contract.check_trees_match(env, params)
+    check_forms(env, params)
     contract.check_observations(env, params, rollout)
     contract.check_constant_elements(env, params, rollout)
     contract.check_same_key_same_trajectory(rollout, run(jax.random.key(0), params))
@@ -142,14 +147,14 @@ class Careless(Ends):
 def test_checks_fail_on_a_careless_environment(rollout) -> None:
     env, params = Careless(), EndsParams()
     for broken, message in [
-        (lambda: contract.check_trees_match(env, params), "weakly typed"),
+        (lambda: check_forms(env, params), "count is a Python number"),
         (lambda: contract.check_invalid_actions_counted(env, params), "invalid_action of"),
-        (lambda: contract.check_observations(env, params, rollout), "above the bound 0.5"),
+        (lambda: contract.check_observations(env, params, rollout), "says 0.0 to 0.5"),
         (lambda: contract.check_constant_elements(env, params, rollout), "and changed"),
         (lambda: contract.check_episodes_end(env, params, rollout), "limit is 2"),
         (lambda: contract.check_flags_exclusive(rollout), "both terminated and truncated"),
     ]:
-        with pytest.raises(AssertionError, match=message):
+        with pytest.raises((AssertionError, UsageError), match=message):
             broken()
 
 

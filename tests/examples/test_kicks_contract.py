@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from examples.kicks import Kicks, KicksState, kick_universe
+from jaxnew.checks import check_forms
 from jaxnew.environment import Action
 from tests import contract
 
@@ -47,7 +48,7 @@ def test_one_trace_serves_every_key_id_and_parameter() -> None:
 
 
 def test_trees_match() -> None:
-    contract.check_trees_match(ENV, PARAMS)
+    check_forms(ENV, PARAMS)
 
 
 def test_observations_are_as_declared(rollout) -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import GridWorld
+from jaxnew.checks import check_forms
 from jaxnew.environment import Action, Environment
 from tests import contract
 
@@ -48,7 +49,7 @@ def test_one_trace_serves_every_key_id_and_parameter() -> None:
 
 
 def test_trees_match() -> None:
-    contract.check_trees_match(ENV, PARAMS)
+    check_forms(ENV, PARAMS)
 
 
 def test_observations_are_as_declared(rollout) -> None:

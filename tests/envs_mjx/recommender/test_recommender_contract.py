@@ -9,6 +9,7 @@ import pytest
 
 from envs_mjx.recommender import Recommender, environment, product_constants, product_vectors
 from envs_mjx.recommender.environment import BANDIT, STOP
+from jaxnew.checks import check_forms
 from jaxnew.environment import Action
 from tests import contract
 
@@ -59,7 +60,7 @@ def test_one_trace_serves_every_key_id_and_parameter() -> None:
 
 
 def test_trees_match() -> None:
-    contract.check_trees_match(ENV, PARAMS)
+    check_forms(ENV, PARAMS)
 
 
 def test_observations_are_as_declared(rollout) -> None:

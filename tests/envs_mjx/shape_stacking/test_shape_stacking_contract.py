@@ -9,6 +9,7 @@ import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, scene
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
+from jaxnew.checks import check_forms
 from tests import contract
 
 pytestmark = pytest.mark.contract
@@ -35,7 +36,7 @@ def test_one_trace_serves_every_key_id_and_parameter() -> None:
 
 
 def test_trees_match() -> None:
-    contract.check_trees_match(ENV, PARAMS)
+    check_forms(ENV, PARAMS)
 
 
 def test_observations_are_as_declared(rollout) -> None:

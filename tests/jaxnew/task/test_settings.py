@@ -349,7 +349,7 @@ def test_rules_of_create_change_what_happens() -> None:
         ({"pool.max_restarts": -1}, "max_restarts=-1 must be 0 or more"),
         ({"pool": "restart"}, r"pool is a group of fields; set one of them: pool\.on_worker_death"),
         ({"environment.rewards": "many"}, "environment.rewards is a group of fields"),
-        ({"environment.move_threshold": 2.0}, "move_threshold=2.0 must be at least 0"),
+        ({"environment.move_threshold": 2.0}, "move_threshold=2.0 must be from 0 to 1"),
     ],
 )
 def test_wrong_settings_of_a_pool(changes: dict[str, Any], says: str) -> None:
