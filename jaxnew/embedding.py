@@ -30,6 +30,7 @@ from jaxnew.representation.sources import RecordingSource
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
+from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageOneBudget, scaled_cost
 from jaxnew.task.domain import Domain, load_task
@@ -270,7 +271,7 @@ def _train(
     data = recordings.for_training(_with_always_available(domain.split, config.train_on))
     is_made = (directory.path / TABLE_FILE).exists()
     if not is_made:
-        print(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
+        say(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
     result = loop.run(
         learner.init(jax.random.key(config.seed), data.shape),
         lambda state, n: _train_chunk(learner, data, state, n),

@@ -24,7 +24,7 @@ import numpy as np
 
 from jaxnew.storage.checkpoint import Checkpointer, Kind
 from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog
-from jaxnew.storage.progress import ProgressDisplay, duration
+from jaxnew.storage.progress import ProgressDisplay, duration, say
 from jaxnew.storage.run_directory import RunDirectory
 
 State = TypeVar("State")
@@ -222,7 +222,7 @@ def _interruption() -> Iterator[Callable[[], bool]]:
 
     def note(number: int, frame: Any) -> None:
         received.append(number)
-        print("Finishing the chunk, then saving; once more to stop at once.", flush=True)
+        say("Finishing the chunk, then saving; once more to stop at once.")
         for which, handler in previous.items():
             signal.signal(which, handler or signal.SIG_DFL)
 

@@ -16,6 +16,7 @@ from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run, load_trainer, locate
 from jaxnew.storage.config import Assignments
+from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageTwoBudget, foretold
 from jaxnew.task.domain import Domain, load_task
@@ -87,10 +88,10 @@ def train(
         open_run(path, trainer, overwrite) as directory,
     ):
         cost = foretold(preset, config)
-        print(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
+        say(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
         result = run_updates(trainer, trainer.init(), directory, title, is_evaluated=True)
     if result.best_metric is not None:
-        print(
+        say(
             f"{path}: update {result.step} of {config.num_updates}; best "
             f"{trainer.selection_metric} {result.best_metric:.3f} at update {result.best_step}."
         )
@@ -139,7 +140,7 @@ def finetune(
         if not is_scratch:
             state = _warm_start(state, source, trainer)
         with open_run(path, trainer, overwrite) as directory:
-            print(f"{title}: {config.num_updates} updates with test actions in {path}.")
+            say(f"{title}: {config.num_updates} updates with test actions in {path}.")
             result = run_updates(trainer, state, directory, title, is_evaluated=False)
     run = Run.of(path, trainer, "latest")
     return replace(run, was_interrupted=result.was_interrupted)
