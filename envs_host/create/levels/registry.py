@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from envs_host.create.levels.schema import Level, LevelError, read_level
+from jaxnew.actions import read_text
 
 TASK_NAMES = (
     "Push",
@@ -124,4 +125,4 @@ def _read_file(path: Path) -> Level:
         raise LevelError(
             f"{path} is no file; give a level's name {level_names()} or its JSON file."
         )
-    return parse_level(path.read_text(), str(path))
+    return parse_level(read_text(path), str(path))
