@@ -22,7 +22,7 @@ from jaxnew.run import Run
 from jaxnew.task.domain import load_task
 from jaxnew.training import train
 
-ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite")
+ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
 # Relative coordinates: raw ones take hours of training to tell skills apart (docs/gotchas.md).

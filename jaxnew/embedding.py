@@ -34,7 +34,7 @@ from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageOneBudget, scaled_cost
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, trusting
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
 from jaxnew.task.task import Play, Task
 
@@ -58,12 +58,13 @@ class Encoder:
     _table: RepresentationTable | None = None
 
     @classmethod
-    def load(cls, path: Path | str, task: Task | None = None) -> Encoder:
+    def load(cls, path: Path | str, task: Task | None = None, *, trust: bool = False) -> Encoder:
         """The encoder of a run of `embed`.
 
         Args:
           path: the run directory.
           task: in place of the one that the run names, for a task that no name or place leads to.
+          trust: import the `package.module` that it names as its task, installed or not.
 
         Raises:
           RunDirectoryError, ConfigError: `path` is no such run.
@@ -78,7 +79,9 @@ class Encoder:
         made = [s["table_hash"] for s in directory.provenance["sessions"] if "table_hash" in s]
         if table is not None and made:
             check_same("table", table.hash, made[-1], path)
-        return cls(directory.path, config, task or load_task(config.task), table)
+        with trusting(trust):
+            task = task or load_task(config.task, is_recorded=True)
+        return cls(directory.path, config, task, table)
 
     @property
     def is_finished(self) -> bool:

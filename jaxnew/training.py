@@ -15,6 +15,7 @@ from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table, is_learned
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run, load_trainer, locate
+from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments
 from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
@@ -118,7 +119,8 @@ def finetune(
     (`docs/method.md`, "Fine-tuning").
 
     Args:
-      source: a run of `train` with the method `ours` or `nearest-neighbour`.
+      source: a run of `train` with the method `ours` or `nearest-neighbour`, or a checkpoint of one
+        (`Run.load`).
       is_scratch: nothing is kept.
       budget, seed, set, overwrite, num_workers: as of `train`.
       workdir: the run directory; default: in that of `source`.
@@ -127,10 +129,10 @@ def finetune(
       UsageError: the source's method has no such continuation, or there is no such budget.
     """
     if not isinstance(source, Run):
-        path, _ = locate(Path(source))
-        trainer = load_trainer(RunDirectory.load(path), num_workers)
+        found = locate(source)
+        trainer = load_trainer(RunDirectory.load(found.path), num_workers)
         _check_continues(trainer.config)  # Runs that cannot go on may have no best checkpoint.
-        source = Run.of(path, trainer, "best")
+        source = Run.of(found.path, trainer, found.kind or "best", found.step)
     config = with_set(finetune_config(source, budget, is_scratch, seed), set)
     table = source.trainer.table
     title = f"finetune-{'scratch' if is_scratch else 'warm'}-{budget}-{config.seed}"
@@ -269,8 +271,16 @@ def finetune_config(source: Run, budget_name: str, is_scratch: bool, seed: int) 
         hyperparameters=budget.hyperparameters,
         loop=budget.loop,
         trained_on="test",
-        start="fresh parameters" if is_scratch else f"{old.method}, seed {old.seed}",
+        start="fresh parameters" if is_scratch else _start(source),
     )
+
+
+def _start(source: Run) -> str:
+    """What a run goes on from: the best checkpoint, unless another is named."""
+    words = f"{source.config.method}, seed {source.config.seed}"
+    newest = Checkpointer(source.path / "checkpoints").steps("best")[-1:]
+    is_best = source.checkpoint == "best" and source.step in newest
+    return words if is_best else f"{words}, {source.checkpoint} checkpoint of update {source.step}"
 
 
 def _check_continues(config: TrainConfig) -> None:

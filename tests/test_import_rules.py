@@ -27,7 +27,17 @@ LAYERS = (
     {"rollout", "ppo"},
     {"loop", "evaluation"},
     {"task"},
-    {"recording", "embedding", "trainer", "new_actions", "run", "runs", "training", "sweeping"},
+    {
+        "recording",
+        "embedding",
+        "trainer",
+        "new_actions",
+        "results",
+        "run",
+        "runs",
+        "training",
+        "sweeping",
+    },
 )
 SIDEWAYS = {
     "observations": {"actions", "storage"},
@@ -35,9 +45,9 @@ SIDEWAYS = {
     "ppo": {"rollout"},
     "embedding": {"recording"},
     "new_actions": {"trainer"},
-    "run": {"embedding", "new_actions", "trainer"},
+    "run": {"embedding", "new_actions", "results", "trainer"},
     "training": {"embedding", "run", "trainer"},
-    "runs": {"run"},
+    "runs": {"results", "run"},
     "sweeping": {"run", "runs", "trainer", "training"},
 }
 

@@ -24,14 +24,13 @@ from experiments.reports.plots import Metric
 from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Question
+from jaxnew.results import Question, on_record
 from jaxnew.runs import is_sweep
 from jaxnew.storage.config import differences, plain
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.domain import load_task
 from jaxnew.task.places import UsageError
-from jaxnew.task.settings import upgraded
+from jaxnew.task.settings import recorded_task, upgraded
 from jaxnew.task.task import Task
 
 # Fields that tell settings of one method and representation apart in a label, most telling first.
@@ -61,13 +60,12 @@ class RunRecord:
 
     @cached_property
     def evaluations(self) -> list[dict[str, Any]]:
-        """What `Run.evaluate` recorded.
+        """What `Run.evaluate` recorded of its checkpoints as they are now.
 
         Raises:
           UsageError: a file is damaged.
         """
-        found = [_read_evaluation(file) for file in sorted(self.path.glob("evaluation/*.json"))]
-        return [e for e in found if "actions" in e and "metrics" in e]
+        return on_record(self.path)
 
     @cached_property
     def table(self) -> RepresentationTable | None:
@@ -248,13 +246,6 @@ def _read_run(path: Path) -> RunRecord:
     return RunRecord(path, upgraded(config))
 
 
-def _read_evaluation(file: Path) -> dict[str, Any]:
-    try:
-        return dict(json.loads(file.read_text(encoding="utf-8")))
-    except ValueError as err:
-        raise UsageError(f"{file} is damaged ({err}); delete it and evaluate again.") from err
-
-
 def policies(paths: Sequence[Path]) -> list[RunRecord]:
     """Those of `read_runs` that are of policies.
 
@@ -288,7 +279,7 @@ def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
                 )
         first = members[0]
         label = f"{first.config['method']}, {first.representation}"
-        groups.append(Group(label, load_task(first.config["task"]), tuple(members)))
+        groups.append(Group(label, recorded_task(first.config), tuple(members)))
     return with_distinct_labels(groups)
 
 

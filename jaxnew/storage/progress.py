@@ -155,7 +155,7 @@ class ProgressDisplay:
             if done >= self._total:
                 continue
             if self._rate:
-                moved = min(self._rate * waited, 0.99 * self._step)
+                moved = min(self._rate * waited, 0.99 * min(self._step, self._total - done))
                 self._show(done + moved, self._note, "about ")
             else:
                 self._show(done, f"{self._note} for {duration(waited)}")

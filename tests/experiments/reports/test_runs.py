@@ -14,7 +14,7 @@ from experiments.reports.paper import paper_set_size
 from experiments.reports.results import result_rows
 from experiments.reports.runs import policies, read_runs
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run import Question
+from jaxnew.results import Question
 from jaxnew.storage import config as config_lib
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import load_task
