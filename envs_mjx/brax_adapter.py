@@ -15,7 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxnew.environment import Action, Environment, checked_ids
+from jaxnew.actions import checked_ids
+from jaxnew.environment import Action, Environment
 
 try:
     from brax.envs.base import Env, State
@@ -96,7 +97,7 @@ class BraxEnvironment(Env):
           ValueError: `ids` is empty or names an action that `env` does not have.
         """
         self._env = env
-        self._ids = checked_ids(env, np.asarray(ids))
+        self._ids = checked_ids(ids, env.action_spec.num_actions)
         self._params = env.default_params if params is None else params
 
     @property

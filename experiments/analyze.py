@@ -20,10 +20,11 @@ from pathlib import Path
 
 from experiments.flags import Arguments
 from experiments.reports.production import Cell, Source
+from experiments.reports.runs import policies
 from experiments.reports.searches import GRIDS, search
 from experiments.reports.studies import NAMES, study_runs
 from experiments.reports.study_report import write_study
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output
 
 ARGUMENTS = Arguments(
     __doc__,
@@ -37,6 +38,8 @@ ARGUMENTS = Arguments(
     "runs",
     "workers",
     "set",
+    "trust",
+    "debug_nans",
 )
 ARGUMENTS.define(
     "string",
@@ -46,9 +49,9 @@ ARGUMENTS.define(
 )
 ARGUMENTS.define("list", "run", [], "Runs of train or sweep to evaluate.")
 ARGUMENTS.define("string", "encoder", None, "Run of embed, for --study=recordings.")
-ARGUMENTS.define("list", "values", [], "Values of the horizontal axis; default: the study's.")
+ARGUMENTS.define("floats", "values", [], "Values of the horizontal axis; default: the study's.")
 ARGUMENTS.define("integer", "episodes", 5000, "Episodes of each evaluation.")
-ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71", "81"], "Seeds of a search.")
+ARGUMENTS.define("integers", "seeds", [31, 41, 51, 61, 71, 81], "Seeds of a search.")
 ARGUMENTS.define("float", "steps", 0.0, "Environment steps of a search's runs; 0: of --budget.")
 ARGUMENTS.define("bool", "dry_run", False, "Of a search, only say what is missing.")
 ARGUMENTS.define("string", "out", None, "Where to write; default: `analysis/` beside the runs.")
@@ -63,30 +66,37 @@ _OF_SEARCHES = (
 def main() -> None:
     if ARGUMENTS.study is None:
         raise UsageError(f"Say which: --study={'|'.join([*NAMES, *GRIDS])}.")
-    values = [float(value) for value in ARGUMENTS.values]
     if ARGUMENTS.study in GRIDS:
         ARGUMENTS.refuse(_OF_STUDIES, "for a search")
         cell, own = Cell(ARGUMENTS.method, ARGUMENTS.representation), Source.asked_for(ARGUMENTS)
         folder = own.domain.folder(own.folder)
-        study = search(ARGUMENTS.study, own, cell, values, ARGUMENTS.dry_run)
+        if not ARGUMENTS.dry_run:
+            output(folder)
+        study = search(ARGUMENTS.study, own, cell, ARGUMENTS.values, ARGUMENTS.dry_run)
     else:
         ARGUMENTS.refuse(_OF_SEARCHES, "for a study of runs")
         if ARGUMENTS.study != "recordings":
             ARGUMENTS.refuse(("encoder",), f"for --study={ARGUMENTS.study}")
         paths = [Path(path) for path in ARGUMENTS.run]
-        folder = Path(*paths[:1]).parent
+        policies(paths)
+        folder = paths[0].parent
+        output(folder)
         study = study_runs(
             ARGUMENTS.study,
             paths,
-            values,
+            ARGUMENTS.values,
             ARGUMENTS.episodes,
             Path(ARGUMENTS.encoder) if ARGUMENTS.encoder else None,
             ARGUMENTS.workers,
         )
     if study is not None:
-        out = Path(ARGUMENTS.out) if ARGUMENTS.out else folder / "analysis"
-        for file in write_study(study, out, study.name.replace("-", "_")):
+        for file in write_study(study, output(folder), study.name.replace("-", "_")):
             print(file)
+
+
+def output(folder: Path) -> Path:
+    """Where a study is written, by default beside the runs."""
+    return check_output(ARGUMENTS.out or folder / "analysis")
 
 
 if __name__ == "__main__":

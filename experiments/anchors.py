@@ -16,12 +16,12 @@ from experiments.flags import Arguments
 from experiments.reports.anchors import FOLDER, Anchors, Line, table_row
 from jaxnew.storage import config as config_lib
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError, load_place
+from jaxnew.task.places import UsageError, check_output, load_place
 
-ARGUMENTS = Arguments(__doc__, "split", "split_seed", "runs")
+ARGUMENTS = Arguments(__doc__, "split", "split_seed", "runs", "debug_nans")
 ARGUMENTS.define("string", "task", "recommender", "Task name, or package.module:TASK.")
 ARGUMENTS.define("list", "sets", ["train", "test"], "Parts of the split.")
-ARGUMENTS.define("list", "set_sizes", [], "Actions in a set; default: the task's own choice.")
+ARGUMENTS.define("integers", "set_sizes", [], "Actions in a set; default: the task's own choice.")
 ARGUMENTS.define("integer", "episodes", 0, "Of each anchor; 0: the task's own choice.")
 ARGUMENTS.define("string", "out", None, "Folder of the files; default: anchors/ beside the runs.")
 ARGUMENTS.define("multi_string", "set", [], "environment.FIELD=value, settings of the environment.")
@@ -30,12 +30,8 @@ ARGUMENTS.define("multi_string", "set", [], "environment.FIELD=value, settings o
 def main() -> None:
     domain = Domain.of(load_task(ARGUMENTS.task), ARGUMENTS.split, ARGUMENTS.split_seed)
     out = Path(ARGUMENTS.out or domain.folder(Path(ARGUMENTS.runs)) / FOLDER)
-    try:
-        sizes = [int(size) for size in ARGUMENTS.set_sizes]
-    except ValueError as err:
-        raise UsageError(f"--set_sizes must be numbers separated by commas: {err}.") from err
     for file in measure_anchors(
-        domain, ARGUMENTS.sets, sizes, ARGUMENTS.episodes, out, ARGUMENTS.set
+        domain, ARGUMENTS.sets, ARGUMENTS.set_sizes, ARGUMENTS.episodes, out, ARGUMENTS.set
     ):
         print(file)
 
@@ -59,7 +55,7 @@ def measure_anchors(
       assignments: `environment.FIELD`, settings of the environment.
 
     Raises:
-      UsageError: the task has no anchors.
+      UsageError: the task has no anchors, or nothing can be written there.
       ConfigError: there is no such setting, or it takes no such value.
     """
     task = domain.task
@@ -72,6 +68,7 @@ def measure_anchors(
     settings = config_lib.set_paths(config_type(task.environment), assignments).environment
     found: dict[int, Anchors] = {}
     line: Line
+    check_output(out)
     for line in measure(domain, parts, sizes, episodes, settings):
         if line.set_size not in found:
             found[line.set_size] = Anchors.of(domain, settings, line)

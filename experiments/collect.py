@@ -17,7 +17,15 @@ from jaxnew.recording import collect, parse_representation, record, stores
 from jaxnew.task.domain import Domain, load_task
 
 ARGUMENTS = Arguments(
-    __doc__, "task", "representation", "budget", "runs", "recordings", "frames", "universe"
+    __doc__,
+    "task",
+    "representation",
+    "budget",
+    "runs",
+    "recordings",
+    "frames",
+    "universe",
+    "debug_nans",
 )
 ARGUMENTS.define(
     "string",

@@ -9,7 +9,6 @@ left-right, as in the release.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
@@ -25,6 +24,7 @@ from envs_host.create.levels.registry import BUILT_IN_NAMES
 from envs_host.create.sprites import Sprite
 from envs_host.create.tools import Tool, ToolClass, all_tools
 from experiments.flags import Arguments
+from jaxnew.task.places import check_output
 
 ARGUMENTS = Arguments(__doc__)
 ARGUMENTS.define("string", "out", "results/create", "Folder of the two pictures.")
@@ -41,8 +41,7 @@ _NUM_COLORS = 200
 
 
 def main() -> None:
-    out = Path(ARGUMENTS.out)
-    out.mkdir(parents=True, exist_ok=True)
+    out = check_output(ARGUMENTS.out)
     for name, sheet in (("levels", levels_sheet()), ("tools", tools_sheet())):
         path = out / f"{name}.png"
         # A palette makes the files a third as large; nobody sees it.

@@ -23,7 +23,7 @@ from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import load_task
 from jaxnew.training import train
 
-ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite")
+ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
 # Relative coordinates: raw ones take hours of training to tell skills apart (docs/gotchas.md).

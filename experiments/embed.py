@@ -22,7 +22,7 @@ _OF_TRAINING = (
     *("task", "representation", "split", "split_seed", "budget", "seed", "workdir", "runs"),
     *("overwrite", "set", "recordings", "frames"),
 )
-ARGUMENTS = Arguments(__doc__, *_OF_TRAINING)
+ARGUMENTS = Arguments(__doc__, *_OF_TRAINING, "trust", "debug_nans")
 ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
 ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
 ARGUMENTS.define(

@@ -10,6 +10,7 @@ RUN may be a sweep: all its runs are evaluated, and shown in one table by what w
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +19,13 @@ from experiments.reports.sweeps import show_sweep
 from jaxnew.actions import load_ids
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Evaluation, Run, locate
-from jaxnew.runs import Runs, is_sweep
+from jaxnew.results import Evaluation
+from jaxnew.run import Run, locate
+from jaxnew.runs import MEMBERS, Runs, is_sweep
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output, file_of
 
-ARGUMENTS = Arguments(__doc__, "workers", "set", "universe")
+ARGUMENTS = Arguments(__doc__, "workers", "set", "universe", "trust", "debug_nans")
 ARGUMENTS.define("string", "run", None, "Run directory of train or sweep, or a checkpoint in it.")
 ARGUMENTS.define(
     "enum",
@@ -54,6 +56,12 @@ ARGUMENTS.define(
 )
 ARGUMENTS.define("float", "unseen_ratio", None, "Share of test actions among train ones.")
 ARGUMENTS.define("integer", "evaluation_seed", EVALUATION_SEED, "Seed of the episodes.")
+ARGUMENTS.define(
+    "string",
+    "output",
+    None,
+    "Folder of the results (.json), for a run that you may not write; default: the run's own.",
+)
 
 
 def main() -> None:
@@ -61,31 +69,48 @@ def main() -> None:
         raise UsageError("Say which run to evaluate: --run=DIRECTORY.")
     if not ARGUMENTS.grows_from:
         ARGUMENTS.refuse(("growth",), "without --grows_from")
-    directory = RunDirectory.load(locate(Path(ARGUMENTS.run))[0])
+    found = locate(ARGUMENTS.run)
+    directory = RunDirectory.load(found.path)
     if is_sweep(directory):
+        if found.kind is not None:
+            raise UsageError(
+                f"{ARGUMENTS.run} holds all members of a sweep at once; give the sweep, or one of "
+                f"{directory.path / MEMBERS}."
+            )
         evaluate_sweep(Runs.load(directory.path))
         return
     with Run.load(
         ARGUMENTS.run, ARGUMENTS.checkpoint, num_workers=ARGUMENTS.workers, set=ARGUMENTS.set
     ) as run:
-        print(evaluated(run))
+        show(evaluated(run, ARGUMENTS.output or True))
 
 
 def evaluate_sweep(runs: Runs) -> None:
     """Every run of a sweep, and one table."""
     ARGUMENTS.refuse(("workers", "set"), "for a sweep, which has no environments on the host")
+    out = Path(ARGUMENTS.output) if ARGUMENTS.output else None
+    if out is None:
+        check_output(runs.path / "figures", "give another folder with --output")
     for run in runs.load_each(ARGUMENTS.checkpoint or "best"):
-        evaluated(run)
-        print(f"{run.path} evaluated.", flush=True)
+        show(evaluated(run, True if out is None else out / run.path.name))
     for row in runs.diverged:
         print(f"{row['path']} diverged by update {row['diverged_at']}; not evaluated.")
-    for file in show_sweep(runs):
-        print(file)
+    if out is None:
+        for file in show_sweep(runs):
+            print(file)
 
 
-def evaluated(run: Run) -> Evaluation:
+def show(evaluation: Evaluation) -> None:
+    """Prints it; the command fails if something is not on record."""
+    print(evaluation, flush=True)
+    if evaluation.problems:
+        sys.exit(1)
+
+
+def evaluated(run: Run, record: bool | Path | str) -> Evaluation:
     """What the flags ask of a run."""
     return run.evaluate(
+        record=record,
         episodes=ARGUMENTS.episodes,
         set_size=ARGUMENTS.set_size,
         grows_from=ARGUMENTS.grows_from,
@@ -107,8 +132,9 @@ def drawn_from(run: Run) -> dict[str, Any]:
     if ARGUMENTS.table is None:
         ARGUMENTS.refuse(["universe", "allow"], "without --table")
     if ARGUMENTS.ids is not None:
-        path = Path(ARGUMENTS.ids)
-        return {"ids": {f"ids-{path.stem}": load_ids(path, run.task.make_universe())}}
+        path = file_of(ARGUMENTS.ids, "--ids takes a text file of action ids.")
+        ids = load_ids(path, run.task.make_universe())
+        return {"ids": {f"ids-{Path(ARGUMENTS.ids).stem}": ids}}
     if ARGUMENTS.table is not None:
         path = Path(ARGUMENTS.table)
         return {

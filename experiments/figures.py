@@ -45,7 +45,7 @@ from experiments.reports.sweeps import show_sweep, sweep_figure
 from jaxnew.runs import MEMBERS, Runs, is_sweep
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import load_task
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output
 
 ARGUMENTS = Arguments(
     __doc__,
@@ -57,6 +57,8 @@ ARGUMENTS = Arguments(
     "runs",
     "workers",
     "set",
+    "trust",
+    "debug_nans",
 )
 ARGUMENTS.define("list", "run", [], "Run directories of train, sweep or embed.")
 ARGUMENTS.define(
@@ -72,7 +74,7 @@ ARGUMENTS.define(
 ARGUMENTS.define("string", "out", None, "Where to write; default: `figures/` of the one run.")
 ARGUMENTS.define("bool", "pdf", False, "Also write every figure as PDF.")
 ARGUMENTS.define("bool", "episode", False, "Also film a zero-shot episode of a run as a GIF.")
-ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71"], "Seeds of the policies.")
+ARGUMENTS.define("integers", "seeds", [31, 41, 51, 61, 71], "Seeds of the policies.")
 ARGUMENTS.define("float", "steps", 0.0, "Environment steps of each run; 0: those of --budget.")
 ARGUMENTS.define("float", "finetune_steps", 0.0, "The same of fine-tuning.")
 ARGUMENTS.define("integer", "episodes", 5000, "Episodes of each evaluation.")
@@ -194,9 +196,10 @@ def make_figures(run_paths: Sequence[Path], out: Path, pdf: bool = False) -> lis
       The files.
 
     Raises:
-      UsageError: the runs are of several tasks, or cannot be drawn.
+      UsageError: the runs are of several tasks, or cannot be drawn; or `out` cannot be written.
       RunDirectoryError: a path is no run directory.
     """
+    check_output(out)
     runs = read_runs(run_paths)
     tasks = {run.config["task"] for run in runs}
     if len(tasks) > 1:

@@ -14,7 +14,9 @@ from experiments.flags import Arguments
 from jaxnew.task.places import UsageError
 from jaxnew.training import finetune
 
-ARGUMENTS = Arguments(__doc__, "budget", "seed", "workdir", "overwrite", "workers", "set")
+ARGUMENTS = Arguments(
+    __doc__, "budget", "seed", "workdir", "overwrite", "workers", "set", "trust", "debug_nans"
+)
 ARGUMENTS.define("string", "run", None, "Run directory of train.")
 ARGUMENTS.define("bool", "scratch", False, "Start from fresh parameters.")
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
 import signal
 import sys
 import textwrap
@@ -14,7 +16,8 @@ from absl import flags, logging
 
 from envs_host.pool import WorkerError
 from jaxnew.loop import InterruptedRunError
-from jaxnew.task.places import UsageError
+from jaxnew.storage.progress import lasting
+from jaxnew.task.places import UsageError, trusting
 
 # Flags of several commands: kind, default, help.
 _SHARED: dict[str, tuple[str, Any, str]] = {
@@ -69,12 +72,29 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
         "from, stored draws all frames once and stores them. The result is the same; default: what "
         "the budget says.",
     ),
+    "trust": (
+        "bool",
+        False,
+        "Import modules that a run names as its task or method, though they are not installed.",
+    ),
+    "debug_nans": ("bool", False, "Stop at the operation that makes a NaN."),
 }
 _OPTIONS: dict[str, dict[str, Any]] = {
     "workers": {"lower_bound": 0},
     "recordings": {"lower_bound": 1},
     "frames": {"choices": ["on-demand", "stored"]},
 }
+
+
+class _NumbersParser(flags.ListParser):
+    """Numbers that are separated by commas."""
+
+    def __init__(self, kind: type[int] | type[float]) -> None:
+        super().__init__()
+        self._kind = kind
+
+    def parse(self, argument: Any) -> list[Any]:
+        return [self._kind(text) for text in super().parse(argument)]
 
 
 class Arguments:
@@ -92,12 +112,16 @@ class Arguments:
         for name in shared:
             kind, default, text = _SHARED[name]
             self.define(kind, name, default, text, **_OPTIONS.get(name, {}))
-        self.define("bool", "debug_nans", False, "Stop at the operation that makes a NaN.")
 
     def define(self, kind: str, name: str, default: Any, text: str, **options: Any) -> None:
-        """Defines a flag: `kind` is string, integer, float, bool, list, enum or multi_string."""
-        make: Any = getattr(flags, f"DEFINE_{kind}")
-        if kind == "enum":
+        """Defines a flag: `kind` is string, integer, float, bool, list, enum or multi_string; or
+        integers or floats, a list of numbers.
+        """
+        make: Any = getattr(flags, f"DEFINE_{kind}", None)
+        if make is None:
+            parser = _NumbersParser({"integers": int, "floats": float}[kind])
+            flags.DEFINE(parser, name, default, text, self._values, **options)
+        elif kind == "enum":
             make(name, default, options["choices"], text, flag_values=self._values)
             text = f"{', '.join(options['choices'])}. {text}"
         else:
@@ -134,8 +158,11 @@ class Arguments:
     def parse(self, arguments: list[str]) -> None:
         """Reads a command line, without the program's name; flags that it lacks have defaults.
 
+        A `~` where a path begins is the user's home, as shells have it elsewhere.
+
         Raises:
-          UsageError: it has something that is no flag of this command, or a value is illegal.
+          UsageError: it has something that is no flag of this command, or a value is illegal, or
+            empty where an empty one says nothing.
         """
         for name in self._texts:
             self._values[name].unparse()
@@ -143,13 +170,17 @@ class Arguments:
         everything.append_flag_values(self._values)
         everything.append_flag_values(_of_absl())
         try:
-            rest = everything(["jaxnew", *arguments])
+            rest = everything(["jaxnew", *map(_at_home, arguments)])
         except flags.Error as err:
             raise UsageError(f"{err} (--help lists the flags.)") from err
         if len(rest) > 1:
             raise UsageError(f"Unknown argument {rest[1]!r}; every option is a --flag=value.")
         self._values.mark_as_parsed()
         flags.FLAGS.mark_as_parsed()
+        for name in self._texts:
+            flag = self._values[name]
+            if flag.present and flag.value in ("", []) and flag.default != "":
+                raise UsageError(f"--{name} is empty; give a value, or leave it out.")
 
     def help_text(self, with_absl: bool = False) -> str:
         """What `--help` shows, and `--helpfull`."""
@@ -170,32 +201,46 @@ class Arguments:
         number, after what was begun has been saved.
         """
         arguments = sys.argv[1:] if arguments is None else arguments
-        for word, is_full in (("--helpfull", True), ("--help", False)):
-            if word in arguments:
-                print(self.help_text(is_full))
-                return
-        try:
-            self.parse(arguments)
-        except UsageError as err:
-            sys.exit(f"UsageError: {err}")
-        logging.set_verbosity(logging.WARNING)  # Orbax logs every file it writes.
-        configure_jax(self.debug_nans)
-        try:
-            stopped_by = main()
-        except InterruptedRunError as err:
-            print(err)
-            stopped_by = err.number
-        except KeyboardInterrupt:
-            if os.environ.get("JAXNEW_TRACEBACK"):
-                raise
-            print("Stopped by Ctrl-C.")
-            stopped_by = signal.SIGINT
-        except (ValueError, ArithmeticError, WorkerError) as err:
-            if self.debug_nans or os.environ.get("JAXNEW_TRACEBACK"):
-                raise
-            sys.exit(f"{type(err).__name__}: {err}\n{_advice(err)}")
+        with contextlib.redirect_stdout(lasting(sys.stdout)):
+            for word, is_full in (("--helpfull", True), ("--help", False)):
+                if word in arguments:
+                    print(self.help_text(is_full), flush=True)
+                    return
+            try:
+                self.parse(arguments)
+            except UsageError as err:
+                sys.exit(f"UsageError: {err}")
+            stopped_by = self._run(main)
         if stopped_by is not None:
             sys.exit(128 + stopped_by)
+
+    def _run(self, main: Callable[[], int | None]) -> int | None:
+        """Runs `main`; returns the number of the signal that stopped it, if one did."""
+        if not flags.FLAGS["verbosity"].present:
+            logging.set_verbosity(logging.WARNING)  # Orbax logs every file it writes.
+        debugs = False
+        if "debug_nans" in self._texts:  # What computes has it.
+            configure_jax()
+            debugs = self.debug_nans
+        with (
+            jax_debug_nans() if debugs else contextlib.nullcontext(),
+            trusting("trust" in self._texts and self.trust),
+        ):
+            try:
+                return main()
+            except InterruptedRunError as err:
+                print(err)
+                return err.number
+            except KeyboardInterrupt:
+                if os.environ.get("JAXNEW_TRACEBACK"):
+                    raise
+                print("Stopped by Ctrl-C.")
+                return signal.SIGINT
+            except (ValueError, ArithmeticError, WorkerError, OSError) as err:
+                is_nameless = isinstance(err, OSError) and err.filename is None
+                if is_nameless or debugs or os.environ.get("JAXNEW_TRACEBACK"):
+                    raise
+                sys.exit(f"{type(err).__name__}: {_said(err)}\n{_advice(err)}")
 
 
 def _of_absl() -> flags.FlagValues:
@@ -212,15 +257,35 @@ def _shown(value: Any) -> str:
     return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
-def configure_jax(debug_nans: bool = False) -> None:
-    """Compiled programs are kept between processes; `debug_nans` is obeyed."""
+def _at_home(word: str) -> str:
+    """A word of a command line, with the home of the user (`--run=~/a,~/b`) as shells write it."""
+    return re.sub(r"(?<=[=,])~[^/,=]*(?=[/,]|$)", lambda found: os.path.expanduser(found[0]), word)
+
+
+def configure_jax() -> None:
+    """Compiled programs are kept between processes, where the user's variables say nothing else."""
     import jax
 
-    cache = os.environ.get("JAX_COMPILATION_CACHE_DIR", str(Path.home() / ".cache" / "jaxnew"))
-    jax.config.update("jax_compilation_cache_dir", cache)
-    if "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS" not in os.environ:
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 1.0)
-    jax.config.update("jax_debug_nans", debug_nans)
+    wanted: dict[str, Any] = {"jax_persistent_cache_min_compile_time_secs": 1.0}
+    with contextlib.suppress(RuntimeError):  # There are users without a home.
+        wanted["jax_compilation_cache_dir"] = str(Path.home() / ".cache" / "jaxnew")
+    for name, value in wanted.items():
+        if name.upper() not in os.environ:
+            jax.config.update(name, value)
+
+
+def jax_debug_nans() -> contextlib.AbstractContextManager[None]:
+    """JAX stops at the operation that makes a NaN."""
+    import jax
+
+    return jax.debug_nans(True)
+
+
+def _said(err: Exception) -> str:
+    """What an error says, in one line."""
+    if isinstance(err, OSError):
+        return f"{err.filename}: {err.strerror}. Give a path that is there and that you may use."
+    return str(err)
 
 
 def _advice(err: Exception) -> str:

@@ -65,7 +65,9 @@ def child(name: str, *arguments: str) -> tuple[list[str], dict[str, str]]:
     root = str(Path(experiments.__file__).parents[1])
     path = os.pathsep.join([root, *filter(None, [os.environ.get("PYTHONPATH")])])
     line = [sys.executable, "-P", "-m", "experiments.main", name, *arguments]
-    return line, {**os.environ, "PYTHONPATH": path, _PARENT: str(os.getpid())}
+    jax = sys.modules.get("jax")
+    debugs = {"JAX_DEBUG_NANS": "1"} if jax is not None and jax.config.jax_debug_nans else {}
+    return line, {**os.environ, "PYTHONPATH": path, **debugs, _PARENT: str(os.getpid())}
 
 
 if __name__ == "__main__":

@@ -10,8 +10,7 @@ evaluations that were made meanwhile.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TypeVar
+import os
 
 import jax
 
@@ -34,8 +33,9 @@ ARGUMENTS = Arguments(
     "runs",
     "overwrite",
     "set",
+    "debug_nans",
 )
-ARGUMENTS.define("list", "seeds", ["31", "41", "51", "61", "71"], "Seeds of the members.")
+ARGUMENTS.define("integers", "seeds", [31, 41, 51, 61, 71], "Seeds of the members.")
 ARGUMENTS.define("multi_string", "vary", [], "hyperparameter=value,value,...")
 ARGUMENTS.define(
     "integer",
@@ -44,16 +44,16 @@ ARGUMENTS.define(
     "Members that a device vmaps; 0: all, or 1 on CPUs.",
     lower_bound=0,
 )
-Number = TypeVar("Number", int, float)
 
 
 def main() -> int | None:
     # Each core is a device; without effect on accelerators.
-    jax.config.update("jax_num_cpu_devices", available_cores())
+    if "JAX_NUM_CPU_DEVICES" not in os.environ:
+        jax.config.update("jax_num_cpu_devices", available_cores())
     found = sweep(
         ARGUMENTS.task,
         ARGUMENTS.representation,
-        seeds=numbers(int, ARGUMENTS.seeds, "--seeds"),
+        seeds=ARGUMENTS.seeds,
         vary=dict(varied(entry) for entry in ARGUMENTS.vary),
         method=ARGUMENTS.method,
         budget=ARGUMENTS.budget,
@@ -79,19 +79,10 @@ def varied(entry: str) -> tuple[str, list[float]]:
       UsageError: it is not `name=value,value`.
     """
     name, _, values = entry.partition("=")
-    return name, numbers(float, values.split(","), f"--vary={entry}, name=value,value,")
-
-
-def numbers(kind: Callable[[str], Number], texts: Sequence[str], what: str) -> list[Number]:
-    """The numbers that texts stand for.
-
-    Raises:
-      UsageError: one of them is none.
-    """
     try:
-        return [kind(text) for text in texts]
+        return name, [float(value) for value in values.split(",")]
     except ValueError as err:
-        raise UsageError(f"{what} must be numbers separated by commas: {err}.") from err
+        raise UsageError(f"--vary={entry}: must be name=value,value,...; {err}.") from err
 
 
 if __name__ == "__main__":

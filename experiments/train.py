@@ -23,6 +23,7 @@ ARGUMENTS = Arguments(
     "overwrite",
     "workers",
     "set",
+    "debug_nans",
 )
 
 

@@ -22,7 +22,7 @@ _HOMES = {
     "Encoder": "jaxnew.embedding",
     "Environment": "jaxnew.environment",
     "Episode": "jaxnew.rollout.contract",
-    "Evaluation": "jaxnew.run",
+    "Evaluation": "jaxnew.results",
     "FixedActionSet": "jaxnew.environment",
     "HostRollout": "jaxnew.rollout.host",
     "Hyperparameters": "jaxnew.ppo",

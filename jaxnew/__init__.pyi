@@ -21,13 +21,13 @@ from jaxnew.recording import record as record
 from jaxnew.representation.config import RepresentationConfig as RepresentationConfig
 from jaxnew.representation.learner import RepresentationLearner as RepresentationLearner
 from jaxnew.representation.table import RepresentationTable as RepresentationTable
+from jaxnew.results import Evaluation as Evaluation
 from jaxnew.rollout.contract import Episode as Episode
 from jaxnew.rollout.contract import Policy as Policy
 from jaxnew.rollout.contract import Rollout as Rollout
 from jaxnew.rollout.contract import RolloutConfig as RolloutConfig
 from jaxnew.rollout.device import DeviceRollout as DeviceRollout
 from jaxnew.rollout.host import HostRollout as HostRollout
-from jaxnew.run import Evaluation as Evaluation
 from jaxnew.run import Run as Run
 from jaxnew.runs import Runs as Runs
 from jaxnew.sampling import ActionPool as ActionPool

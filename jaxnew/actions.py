@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxnew.storage.files import read_json, write_bytes_atomically
 
@@ -206,10 +207,10 @@ class ActionSplit:
     def __post_init__(self) -> None:
         owner: dict[int, str] = {}
         for name in (*SPLIT_NAMES, "always_available"):
-            ids = np.asarray(getattr(self, name), np.int32)
-            if ids.ndim != 1 or (name in SPLIT_NAMES and ids.size == 0):
-                raise ValueError(f"{name} must be a non-empty list of ids, got shape {ids.shape}.")
-            object.__setattr__(self, name, np.sort(ids))
+            ids = np.asarray(getattr(self, name))
+            if ids.size or name in SPLIT_NAMES:
+                ids = checked_ids(ids, what=name)
+            object.__setattr__(self, name, np.sort(ids.astype(np.int32)))
             for action_id in ids.tolist():
                 if action_id in owner:
                     raise ValueError(
@@ -348,25 +349,58 @@ def mixture_ids(seen: np.ndarray, unseen: np.ndarray, unseen_ratio: float) -> np
     return np.concatenate([unseen[:num_unseen], seen[:num_seen]]).astype(np.int32)
 
 
+def checked_ids(ids: ArrayLike, num_actions: int = 2**31, what: str = "ids") -> np.ndarray:
+    """int32[n] distinct ids of `num_actions` actions; numbers that are no integers stay none.
+
+    Args:
+      ids: int[n].
+      what: they are, for the message.
+
+    Raises:
+      ValueError: they are something else, or none.
+    """
+    given = np.asarray(ids)
+    if given.ndim != 1 or given.size == 0 or given.dtype.kind not in "iu":
+        raise ValueError(
+            f"{what}: must be a non-empty list of integers, got {given.dtype} of shape "
+            f"{given.shape}."
+        )
+    outside = given[(given < 0) | (given >= num_actions)]
+    if outside.size:
+        raise ValueError(f"{what}: action {outside[0]} is not in 0..{num_actions - 1}.")
+    values, counts = np.unique(given, return_counts=True)
+    if len(values) < len(given):
+        raise ValueError(
+            f"{what}: action {values[counts.argmax()]} stands there twice; list each id once."
+        )
+    return given.astype(np.int32)
+
+
+def read_text(path: Path | str) -> str:
+    """A user's text file, with or without the mark of byte order that some editors write.
+
+    Raises:
+      ValueError: it is no UTF-8.
+      OSError: it cannot be read.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8-sig")
+    except UnicodeDecodeError as err:
+        raise ValueError(f"{path} is no UTF-8 text ({err.reason}); save it as UTF-8.") from err
+
+
 def load_ids(path: Path, universe: ActionUniverse) -> np.ndarray:
     """int32[n] action ids from a text file: one id per line or separated by commas or spaces.
 
     Raises:
       ValueError: the file holds something else than ids of `universe`, or an id twice.
+      OSError: it cannot be read.
     """
-    words = path.read_text().replace(",", " ").split()
+    words = read_text(path).replace(",", " ").split()
+    if not words:
+        raise ValueError(f"{path} holds no action id.")
     try:
         ids = np.array([int(word) for word in words], np.int64)
-    except ValueError as err:
+    except (ValueError, OverflowError) as err:
         raise ValueError(f"{path} must hold integer action ids only: {err}.") from err
-    if ids.size == 0:
-        raise ValueError(f"{path} holds no action id.")
-    outside = ids[(ids < 0) | (ids >= universe.num_actions)]
-    if outside.size:
-        raise ValueError(
-            f"{path} names action {outside[0]}; {universe.name} has 0..{universe.num_actions - 1}."
-        )
-    values, counts = np.unique(ids, return_counts=True)
-    if (counts > 1).any():
-        raise ValueError(f"{path} names action {values[counts.argmax()]} twice; list each id once.")
-    return ids.astype(np.int32)
+    return checked_ids(ids, universe.num_actions, f"{path}, ids of {universe.name}")

@@ -36,7 +36,7 @@ from jaxnew.storage.files import (
     take_lock,
     write_json_atomically,
 )
-from jaxnew.storage.progress import ProgressDisplay
+from jaxnew.storage.progress import ProgressDisplay, say
 
 KIND = "jaxnew action recordings"
 FORMAT_VERSION = 1
@@ -156,7 +156,7 @@ def _wait_for_lock(path: Path) -> int:
             return take_lock(path / ".lock")
         except BlockingIOError as err:
             if not is_announced:
-                print(f"Waiting for another process that collects in {path} ({err}).", flush=True)
+                say(f"Waiting for another process that collects in {path} ({err}).")
                 is_announced = True
             time.sleep(0.5)
 

@@ -29,10 +29,11 @@ from jaxnew.representation.modality import Modality
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
+from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageOneBudget, scaled_cost
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, trusting
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
 from jaxnew.task.task import Play, Task
 
@@ -58,12 +59,13 @@ class Encoder:
     _table: RepresentationTable | None = None
 
     @classmethod
-    def load(cls, path: Path | str, task: Task | None = None) -> Encoder:
+    def load(cls, path: Path | str, task: Task | None = None, *, trust: bool = False) -> Encoder:
         """The encoder of a run of `embed`.
 
         Args:
           path: the run directory.
           task: in place of the one that the run names, for a task that no name or place leads to.
+          trust: import the `package.module` that it names as its task, installed or not.
 
         Raises:
           RunDirectoryError, ConfigError: `path` is no such run.
@@ -75,7 +77,9 @@ class Encoder:
         config = from_dict(EmbedConfig, upgraded(directory.config))
         is_made = (directory.path / TABLE_FILE).exists()
         table = load_table(directory.path) if is_made else None
-        return cls(directory.path, config, task or load_task(config.task), _table=table)
+        with trusting(trust):
+            task = task or load_task(config.task, is_recorded=True)
+        return cls(directory.path, config, task, _table=table)
 
     @property
     def is_finished(self) -> bool:
@@ -277,7 +281,7 @@ def _train(
     is_made = (directory.path / TABLE_FILE).exists()
     chunk_steps = min(preset.chunk_steps, preset.checkpoint_every)
     if not is_made:
-        print(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
+        say(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
     result = loop.run(
         learner.init(jax.random.key(config.seed), data.shape),
         lambda state, n: learner.train_steps(state, data, n),

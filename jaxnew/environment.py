@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxnew.actions import checked_ids
+
 State = TypeVar("State")
 Params = TypeVar("Params")
 Info = dict[str, jax.Array]
@@ -166,19 +168,6 @@ class Box:
         return jnp.all((value >= self.low) & (value <= self.high))
 
 
-def checked_ids(env: Environment, ids: np.ndarray) -> np.ndarray:
-    """int32[n] `ids` as a fixed list of actions of `env`.
-
-    Raises:
-      ValueError: `ids` is empty or names an action that `env` does not have.
-    """
-    ids = np.asarray(ids, np.int32)
-    num_actions = env.action_spec.num_actions
-    if ids.ndim != 1 or ids.size == 0 or ids.min() < 0 or ids.max() >= num_actions:
-        raise ValueError(f"ids must be a non-empty list of ids in 0..{num_actions - 1}, got {ids}.")
-    return ids
-
-
 class FixedActionSet:
     """`env` with one fixed list of action ids: a plain integer-action environment.
 
@@ -188,13 +177,13 @@ class FixedActionSet:
     treats as it documents.
 
     Raises:
-      ValueError: `ids` is empty or names an action that `env` does not have, or `env` needs a
-        position or a stop bit beside the id.
+      ValueError: `ids` are no distinct actions of `env`, or `env` needs a position or a stop bit
+        beside the id.
     """
 
     def __init__(self, env: Environment, ids: np.ndarray) -> None:
-        ids = checked_ids(env, ids)
         spec = env.action_spec
+        ids = checked_ids(ids, spec.num_actions)
         if spec.position_dim or spec.has_stop:
             raise ValueError(
                 f"{env.name} actions have a position or a stop bit, so they are not one integer."

@@ -13,7 +13,6 @@ import contextlib
 import dataclasses
 import fnmatch
 import math
-import os
 import signal
 import time
 import warnings
@@ -28,7 +27,7 @@ import numpy as np
 from jaxnew import finiteness
 from jaxnew.storage.checkpoint import KINDS, Checkpointer, CheckpointError, Kind
 from jaxnew.storage.metrics import TIME_PREFIX, MetricsLog, read
-from jaxnew.storage.progress import ProgressDisplay, duration
+from jaxnew.storage.progress import ProgressDisplay, duration, say
 from jaxnew.storage.run_directory import RunDirectory
 
 State = TypeVar("State")
@@ -241,9 +240,7 @@ def _interruption() -> Iterator[list[int]]:
 
     def note(number: int, frame: Any) -> None:
         received.append(number)
-        # Not by `print`, which may be what the signal interrupts.
-        with contextlib.suppress(OSError):
-            os.write(1, b"Finishing the chunk, then saving; once more to stop at once.\n")
+        say("Finishing the chunk, then saving; once more to stop at once.")
         for which, handler in previous.items():
             signal.signal(which, handler or signal.SIG_DFL)
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxnew import actions
 from jaxnew.actions import ActionIdentity, ActionUniverse, content_hash
 from jaxnew.storage.arrays import read_arrays
 from jaxnew.storage.files import write_bytes_atomically
@@ -205,20 +206,11 @@ class Recordings:
 
 def checked_ids(ids: np.ndarray, universe: ActionUniverse | None, where: str) -> np.ndarray:
     """int32[n] copy of distinct legal ids."""
-    checked = np.asarray(ids)
-    if checked.ndim != 1 or checked.size == 0 or not np.issubdtype(checked.dtype, np.integer):
-        raise ObservationsError(
-            f"{where}: ids must be a non-empty vector of integers, got {checked.dtype}"
-            f"{list(checked.shape)}."
-        )
-    limit = 2**31 if universe is None else universe.num_actions
-    if checked.min() < 0 or checked.max() >= limit:
-        raise ObservationsError(
-            f"{where}: ids span {checked.min()}..{checked.max()}; legal are 0..{limit - 1}."
-        )
-    if len(np.unique(checked)) != len(checked):
-        raise ObservationsError(f"{where}: an id is listed twice; list each once.")
-    return checked.astype(np.int32)
+    limit = {} if universe is None else {"num_actions": universe.num_actions}
+    try:
+        return actions.checked_ids(ids, **limit, what=f"{where}, ids")
+    except ValueError as err:
+        raise ObservationsError(str(err)) from err
 
 
 def row_hash(rows: np.ndarray) -> str:

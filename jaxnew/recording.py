@@ -20,6 +20,7 @@ from jaxnew.observations import RecordingFormat, Recordings
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.sources import DrawnRecordings, RecordingSource, StoredRecordings
 from jaxnew.storage.files import check_new
+from jaxnew.storage.progress import say
 from jaxnew.task.budgets import StageOneBudget
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
@@ -123,7 +124,7 @@ def collect(
     ids = np.arange(domain.universe.num_actions, dtype=np.int32)
     drawing = play.drawing
     if drawing is not None:
-        print(_sizes(play.format, drawing.format, len(ids), num_recordings, stores_drawn))
+        say(_sizes(play.format, drawing.format, len(ids), num_recordings, stores_drawn))
     path = folder / f"{play.folder}-{num_recordings}"
     recorded = _recorded(path, domain, play, ids, num_recordings, seed)
     if drawing is None or not stores_drawn:

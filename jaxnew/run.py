@@ -6,23 +6,26 @@ import time
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, NamedTuple, Self, cast
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
-from jaxnew.actions import ActionSplit, check_same, mixture_ids
+from jaxnew.actions import SPLIT_NAMES, ActionSplit, check_same, content_hash, mixture_ids
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.evaluation import EVALUATION_SEED, measure, play, summarize
 from jaxnew.loop import NonFiniteError
 from jaxnew.new_actions import offer
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.results import Evaluation, file_stem
 from jaxnew.rollout.contract import Episode, Policy
 from jaxnew.sampling import Actions
 from jaxnew.storage.checkpoint import KINDS, Checkpointer, Kind
-from jaxnew.storage.config import Assignments
+from jaxnew.storage.config import Assignments, ConfigError
+from jaxnew.storage.files import write_json_atomically
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output, trusting
 from jaxnew.task.settings import (
     TrainConfig,
     check_seed,
@@ -31,80 +34,6 @@ from jaxnew.task.settings import (
 )
 from jaxnew.task.task import Task
 from jaxnew.trainer import Trainer
-
-
-@dataclass(frozen=True)
-class Question:
-    """What an evaluation tells: how a policy does on sets of some actions.
-
-    Attributes:
-      actions: name of what sets are drawn from, such as a part of the split.
-      set_size: m; None for all that there are.
-      first_size, growth: of a set that grows during the episode, see `Actions.first_size`.
-      checkpoint: whose policy.
-      policy: `sampled` or `greedy`.
-    """
-
-    actions: str
-    set_size: int | None
-    first_size: int = 0
-    growth: int = 1
-    checkpoint: str = "best"
-    policy: str = "sampled"
-
-    def is_answered_by(self, evaluation: Mapping[str, Any], episodes: int = 1) -> bool:
-        """Whether an evaluation on record is the one.
-
-        Args:
-          evaluation: what `Run.record` wrote.
-          episodes: it has at least so many, of the seed that all runs share.
-        """
-        size, whole = evaluation["set_size"], evaluation.get("num_actions", float("inf"))
-        first_size = evaluation.get("first_size", 0)
-        return (
-            (evaluation["actions"], evaluation["checkpoint"], evaluation["policy"])
-            == (self.actions, self.checkpoint, self.policy)
-            and (size >= whole if self.set_size is None else size == self.set_size)
-            and first_size == self.first_size
-            and (not first_size or evaluation["growth"] == self.growth)
-            and evaluation["num_episodes"] >= episodes
-            and evaluation.get("evaluation_seed", EVALUATION_SEED) == EVALUATION_SEED
-        )
-
-
-@dataclass(frozen=True)
-class Evaluation:
-    """Numbers of one checkpoint, by list of actions; prints as a table.
-
-    Attributes:
-      title: which checkpoint of which run.
-      rows: by name of the actions what `to_dict` returns.
-    """
-
-    title: str
-    rows: Mapping[str, Mapping[str, Any]]
-
-    def to_dict(self) -> dict[str, dict[str, Any]]:
-        """By name of the actions: `metrics`, each with `mean`, `low`, `high` and the kind of
-        `interval` over episodes; `num_episodes`, `num_actions`, `set_size`, `policy`,
-        `evaluation_seed` and `seconds`.
-        """
-        return {name: dict(row) for name, row in self.rows.items()}
-
-    def __str__(self) -> str:
-        lines = [f"{self.title}; mean [95 % interval over episodes]"]
-        for name, row in self.rows.items():
-            metrics = "  ".join(
-                f"{metric} {value['mean']:.4f} [{value['low']:.4f}, {value['high']:.4f}]"
-                for metric, value in row["metrics"].items()
-            )
-            lines.append(f"{name:>12} ({row['num_episodes']} episodes, {row['policy']}): {metrics}")
-            if "num_seen" in row:
-                lines.append(
-                    f"{'':>12} {row['num_actions']} actions of {row['universe']}, "
-                    f"{row['num_seen']} seen in training, e.g. {'; '.join(row['examples'])}"
-                )
-        return "\n".join(lines)
 
 
 @dataclass(frozen=True)
@@ -140,41 +69,49 @@ class Run:
         task: Task | None = None,
         num_workers: int = 0,
         set: Assignments = (),
+        trust: bool = False,
     ) -> Run:
         """The policy of a run of `train`, `finetune` or a member of `sweep`.
 
         Args:
-          path: the run directory, or one of its checkpoints.
+          path: the run directory; or one of its checkpoints, `checkpoints/KIND` for the newest of
+            a kind and `checkpoints/KIND/STEP` for that of a step.
           checkpoint: `best` or `latest`; None for what `path` names, else `best`.
           task: in place of the one that the run names, for a task that no name or place leads to.
           num_workers: processes for environments on the host; 0: one per core.
           set: `pool.FIELD` alone, how environments on the host are run.
+          trust: import the `package.module` that the run names as task or method, installed or not.
 
         Raises:
-          UsageError: `path` is neither a run nor in one.
+          UsageError: `path` is neither a run nor a checkpoint of one, or not of that kind; or the
+            run names what has to be trusted.
           RunDirectoryError, ConfigError: it is no run of a policy.
           SplitMismatch: split or table were changed since.
           CheckpointError: there is no such checkpoint.
           NonFiniteError: there is none, because the run diverged before.
         """
-        path, named = locate(Path(path))
-        directory = RunDirectory.load(path)
-        trainer = load_trainer(directory, num_workers, set, task)
-        return cls.of(directory.path, trainer, checkpoint or named or "best")
+        found = locate(path)
+        if found.kind not in (None, checkpoint or found.kind):
+            raise UsageError(f"{path} is a {found.kind} checkpoint, not a {checkpoint} one.")
+        directory = RunDirectory.load(found.path)
+        with trusting(trust):
+            trainer = load_trainer(directory, num_workers, set, task)
+        return cls.of(directory.path, trainer, checkpoint or found.kind or "best", found.step)
 
     @classmethod
-    def of(cls, path: Path, trainer: Trainer, checkpoint: Kind) -> Run:
-        """A checkpoint of a run whose parts are there."""
+    def of(cls, path: Path, trainer: Trainer, checkpoint: Kind, step: int | None = None) -> Run:
+        """A checkpoint of a run whose parts are there; without a `step` the newest of its kind."""
         example = trainer.learner.policy_shapes(trainer.training)
         checkpointer = Checkpointer(path / "checkpoints")
         if not checkpointer.steps(checkpoint) and checkpointer.steps("latest"):
             update = checkpointer.metadata("latest").get("diverged_at")
             if update is not None:
                 raise _unsound(f"{path} diverged by update {update}, before its first evaluation")
-        state, metadata = checkpointer.restore(checkpoint, example, is_part=True)
+        state, metadata = checkpointer.restore(checkpoint, example, step, is_part=True)
         diverged_at = metadata.get("diverged_at")
-        step = int(state.step)
-        return cls(path, trainer, state.policy, step, checkpoint, diverged_at=diverged_at)
+        return cls(
+            path, trainer, state.policy, int(state.step), checkpoint, diverged_at=diverged_at
+        )
 
     @property
     def was_interrupted(self) -> bool:
@@ -200,7 +137,7 @@ class Run:
         self,
         parts: str | Sequence[str] = (),
         *,
-        ids: Mapping[str, np.ndarray] | None = None,
+        ids: Mapping[str, ArrayLike] | None = None,
         table: RepresentationTable | None = None,
         table_name: str = "",
         universe: str = "",
@@ -212,14 +149,14 @@ class Run:
         growth: int = 1,
         greedy: bool = False,
         seed: int = EVALUATION_SEED,
-        record: bool = True,
+        record: bool | Path | str = True,
     ) -> Evaluation:
         """Plays episodes on action sets, with no further training.
 
         Args:
           parts: of the split, one or several of `train`, `validation`, `test`, `all`; default:
             `test`, where nothing else says what to draw from.
-          ids: by name, int32[n] actions to draw sets from.
+          ids: by name, int[n] actions to draw sets from.
           table: representations of actions, which are drawn from. They need not have existed at
             training, and are found by what they do, not by their numbers.
           table_name: what its results are called; default: the beginning of its hash.
@@ -231,13 +168,18 @@ class Run:
           grows_from, growth: of a set that grows during the episode, see `Actions.first_size`.
           greedy: take the most likely action instead of sampling.
           seed: of the episodes.
-          record: keep the results in the run directory, `evaluation/*.json`.
+          record: keep the results in the run directory, `evaluation/*.json`; or in another folder.
+            Every question has a file of its own.
+
+        Returns:
+          The results, also of what could not be recorded, which it says.
 
         Raises:
           UsageError: several of `parts`, `ids`, `table`, `unseen_ratio` are given, or see `offer`.
           SplitMismatch: the table is none for this run, see `offer`.
           ValueError: there are no such sets.
           NonFiniteError: the run diverged, or parameters of its policy are not finite.
+          UsageError: nothing can be recorded there.
         """
         self._check_sound()
         check_seed(seed, "seed of the evaluation")
@@ -249,28 +191,45 @@ class Run:
             )
         if table is None and (universe or allow):
             raise UsageError("universe and allow are about the actions of a table; give one.")
+        folder = self.path / "evaluation" if record is True else Path(record or "")
+        if record:
+            check_output(folder, "record elsewhere (--output, record) or not at all (record=False)")
         asked = (episodes, seed, greedy)
         rows: dict[str, dict[str, Any]] = {}
+        problems: list[str] = []
 
-        def play_with(trainer: Trainer, name: str, actions: Actions, **more: Any) -> None:
+        def play_with(
+            trainer: Trainer, name: str, actions: Actions, known_as: str, **more: Any
+        ) -> None:
             row = self._row(trainer, actions.growing(grows_from, growth), *asked)
             rows[name] = {**row, **more}
-            if record:
-                self.record(name, rows[name])
+            if not record:
+                return
+            try:
+                self.record(known_as, rows[name], None if record is True else folder)
+            except (OSError, ValueError) as err:  # What was played is not lost for it.
+                problems.append(f"{name} is not on record: {err}")
 
         if table is not None:
-            name = f"table-{table_name or table.hash[:8]}"
             new = offer(self.trainer, table, universe, allow)
+            digest = content_hash(table.hash, new.identity.universe)[:8]
+            name = f"table-{table_name or digest}"
+            known_as = f"{name}-{digest}" if table_name else name
             try:
                 actions = new.trainer.actions(name, new.ids, set_size, new.vectors)
-                play_with(new.trainer, name, actions, **new.describe())
+                play_with(new.trainer, name, actions, known_as, **new.describe())
             finally:
                 if new.trainer is not self.trainer:
                     new.trainer.close()
         else:
-            for name, chosen in self._lists(named, ids, unseen_ratio).items():
-                play_with(self.trainer, name, self.trainer.actions(name, chosen, set_size))
-        return Evaluation(f"{self.path}, {self.checkpoint} checkpoint (update {self.step})", rows)
+            lists = self._lists(named, ids, unseen_ratio)
+            drawn = {n: self.trainer.actions(n, chosen, set_size) for n, chosen in lists.items()}
+            for name, actions in drawn.items():
+                chosen = lists[name] if ids is not None else None
+                known_as = name if chosen is None else f"{name}-{content_hash(chosen)[:8]}"
+                play_with(self.trainer, name, actions, known_as)
+        title = f"{self.path}, {self.checkpoint} checkpoint (update {self.step})"
+        return Evaluation(title, rows, tuple(problems))
 
     def _row(
         self, trainer: Trainer, actions: Actions, episodes: int, seed: int, greedy: bool
@@ -278,8 +237,10 @@ class Run:
         start = time.perf_counter()
         played = measure(trainer.rollout, self.policy, actions, episodes, seed, greedy)
         growth = {"first_size": actions.first_size, "growth": actions.growth}
+        numbers, selected = summarize(played), self.task.selection_metric
+        first = {selected: numbers[selected]} if selected in numbers else {}
         return {
-            "metrics": summarize(played),
+            "metrics": {**first, **numbers},
             "num_episodes": episodes,
             "num_actions": int(actions.pool.size),
             "set_size": actions.set_size,
@@ -292,21 +253,31 @@ class Run:
     def _lists(
         self,
         parts: tuple[str, ...],
-        ids: Mapping[str, np.ndarray] | None,
+        ids: Mapping[str, ArrayLike] | None,
         unseen_ratio: float | None,
     ) -> dict[str, np.ndarray | None]:
         """By name, the actions to draw from; None for a part of the split."""
         if ids is not None:
-            return dict(ids)
+            taken = {*SPLIT_NAMES, "all"}
+            if not isinstance(ids, Mapping) or not ids or taken.intersection(ids):
+                raise UsageError(
+                    "ids are lists by name, such as {'mine': [1, 2, 3]}, at least one; names of "
+                    f"parts of the split ({', '.join(sorted(taken))}) are taken."
+                )
+            return {name: np.asarray(listed) for name, listed in ids.items()}
         if unseen_ratio is not None:
             mixed = mixture_ids(self.split.train, self.split.test, unseen_ratio)
             return {f"unseen-{unseen_ratio:g}": mixed}
         return dict.fromkeys(parts or ("test",))
 
-    def record(self, name: str, row: Mapping[str, Any]) -> Path:
-        """Keeps one result in the run directory; returns its file."""
+    def record(self, name: str, row: Mapping[str, Any], folder: Path | None = None) -> Path:
+        """Keeps one result in the run directory, or in another folder; returns its file."""
         content = {"checkpoint": self.checkpoint, "step": self.step, "actions": name, **row}
-        return RunDirectory.load(self.path).record_evaluation(file_stem(content), content)
+        if folder is None:
+            return RunDirectory.load(self.path).record_evaluation(file_stem(content), content)
+        file = folder / f"{file_stem(content)}.json"
+        write_json_atomically(file, {"run": str(self.path.absolute()), **content})
+        return file
 
     def play(
         self, part: str = "test", first: int = 0, count: int = 1, seed: int = EVALUATION_SEED
@@ -346,18 +317,46 @@ class Run:
         self.close()
 
 
-def locate(path: Path) -> tuple[Path, Kind | None]:
-    """The run directory that `path` is or lies in, and the kind of checkpoint that it names.
+class Located(NamedTuple):
+    """What a path to a run names.
+
+    Attributes:
+      path: the run directory.
+      kind: of the checkpoint; None: the run itself was named.
+      step: of the checkpoint; None: the newest of its kind.
+    """
+
+    path: Path
+    kind: Kind | None = None
+    step: int | None = None
+
+
+def locate(path: Path | str) -> Located:
+    """The run directory that `path` is, or the checkpoint in one, and nothing but what it names.
 
     Raises:
       UsageError: it is neither.
     """
-    for folder in (path, *path.parents):
-        if (folder / "config.json").is_file():
-            inside = path.relative_to(folder).parts
-            is_named = len(inside) > 1 and inside[0] == "checkpoints" and inside[1] in KINDS
-            return folder, cast(Kind, inside[1]) if is_named else None
-    raise UsageError(f"{path} is neither a run directory nor in one (no config.json).")
+    path = Path(path)
+    if (path / "config.json").is_file():
+        return Located(path)
+    whole = path.resolve()
+    run = next((folder for folder in whole.parents if (folder / "config.json").is_file()), None)
+    if run is None:
+        raise UsageError(
+            f"{path} is neither a run directory nor a checkpoint in one (no config.json)."
+        )
+    inside = whole.relative_to(run).parts
+    place, kind, step = (*inside, "", "")[:3]
+    is_one = place == "checkpoints" and kind in KINDS and (step.isdecimal() or not step)
+    if not is_one or len(inside) > 3 or not whole.is_dir():
+        there = sorted(run.glob("checkpoints/*/*"))
+        listed = ", ".join(str(p.relative_to(run)) for p in there if p.name.isdecimal())
+        raise UsageError(
+            f"{path} is no checkpoint of {run}; give the run itself or one of its checkpoints: "
+            f"{listed or 'there are none'}."
+        )
+    return Located(run, cast(Kind, kind), int(step) if step else None)
 
 
 def load_trainer(
@@ -367,7 +366,10 @@ def load_trainer(
     task: Task | None = None,
 ) -> Trainer:
     """The parts of a run, from its directory alone; see `Run.load`."""
-    config, task = read_train_config(directory.config, task)
+    try:
+        config, task = read_train_config(directory.config, task)
+    except ConfigError as err:
+        raise ConfigError(f"{directory.path}: {err}") from err
     config = only_computed(config, assignments)
     split = ActionSplit.load(directory.path / SPLIT_FILE)
     table = RepresentationTable.load(directory.path / TABLE_FILE)
@@ -384,10 +386,3 @@ def _unsound(what: str) -> NonFiniteError:
         f"{what}, so that nothing it plays tells anything. `nonfinite/*` in its metrics.jsonl says "
         "what was not finite first; train again with other settings."
     )
-
-
-def file_stem(content: Mapping[str, Any]) -> str:
-    """What a result is called: results that were made differently have files of their own."""
-    grown = f"-from{content['first_size']}-by{content['growth']}" if "first_size" in content else ""
-    stem = "{actions}-{checkpoint}-{policy}-m{set_size}".format(**content)
-    return f"{stem}{grown}"

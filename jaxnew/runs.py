@@ -10,12 +10,12 @@ from typing import Any, Self
 import numpy as np
 
 from jaxnew.ppo import Hyperparameters
+from jaxnew.results import label, on_record
 from jaxnew.run import Run, load_trainer
 from jaxnew.storage.checkpoint import Kind
 from jaxnew.storage.run_directory import RunDirectory
-from jaxnew.task.domain import load_task
-from jaxnew.task.places import UsageError
-from jaxnew.task.settings import read_train_config
+from jaxnew.task.places import UsageError, trusting
+from jaxnew.task.settings import read_train_config, recorded_task
 from jaxnew.task.task import Task
 
 MEMBERS = "members"  # Name of the folder of the runs, and of the file of their rows.
@@ -41,15 +41,16 @@ class Runs:
     interrupted_by: int | None = None
 
     @classmethod
-    def load(cls, path: Path | str, task: Task | None = None) -> Self:
+    def load(cls, path: Path | str, task: Task | None = None, *, trust: bool = False) -> Self:
         """The runs of a finished sweep.
 
         Args:
           path: its directory.
           task: in place of the one that it names, for a task that no name or place leads to.
+          trust: import what it names as task or method, installed or not.
 
         Raises:
-          UsageError: it is no sweep, or was interrupted.
+          UsageError: it is no sweep, or was interrupted, or names what has to be trusted.
           RunDirectoryError: it is no run directory.
         """
         directory = RunDirectory.load(path)
@@ -61,7 +62,8 @@ class Runs:
             raise UsageError(
                 f"The sweep {path} has written no members yet; run it to its end."
             ) from err
-        task = task or load_task(directory.config[MEMBERS][0]["task"])
+        with trusting(trust):
+            task = recorded_task(directory.config[MEMBERS][0], task)
         rows = tuple(_row(entry, directory.path / MEMBERS) for entry in recorded)
         return cls(directory.path, rows, task)
 
@@ -78,17 +80,15 @@ class Runs:
 
     def table(self) -> list[dict[str, Any]]:
         """Rows for `pandas.DataFrame`: `rows`, and what the runs' evaluations on record found, mean
-        selection metrics by the name of the evaluation's file (`test-best-sampled-m50`).
+        selection metrics by what was evaluated (`test-best-sampled-m50`).
         """
         return [{**row, **self._evaluated(Path(row["path"]))} for row in self.rows]
 
     def _evaluated(self, path: Path) -> dict[str, float]:
-        files = RunDirectory.load(path).evaluations()
         metric = self.task.selection_metric
+        found = {label(e): e["metrics"] for e in on_record(path)}
         return {
-            name: files[name]["metrics"][metric]["mean"]
-            for name in files
-            if metric in files[name].get("metrics", {})
+            name: found[name][metric]["mean"] for name in sorted(found) if metric in found[name]
         }
 
     def groups(self) -> list[tuple[dict[str, Any], dict[str, np.ndarray]]]:

@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
+from jaxnew.actions import checked_ids
+
 
 @struct.dataclass
 class AvailableSet:
@@ -68,14 +70,15 @@ class ActionPool:
         if capacity > _MAX_POOL:
             raise ValueError(f"A pool holds at most {_MAX_POOL} actions, not {capacity}.")
         always = np.zeros(0, np.int32) if always_available is None else always_available
-        members = np.setdiff1d(np.asarray(ids, np.int32), always)
-        if members.size == 0 or len(np.unique(ids)) != len(ids):
-            raise ValueError(f"A pool needs distinct ids and at least one, got {ids}.")
+        ids = checked_ids(ids)
+        members = np.setdiff1d(ids, always)
+        if members.size == 0:
+            raise ValueError(f"A pool needs more than the always available ids {always}.")
         if len(members) > capacity:
             raise ValueError(f"{len(members)} ids do not fit a pool of capacity {capacity}.")
         starts = None
         if groups is not None:
-            members, starts = _by_group(np.asarray(ids, np.int32), np.asarray(groups), members)
+            members, starts = _by_group(ids, np.asarray(groups), members)
         padded = np.full(capacity, members[0], np.int32)
         padded[: len(members)] = members
         return cls(
@@ -192,8 +195,8 @@ class Actions:
         Raises:
           ValueError: there are no such sets.
         """
-        table = jnp.asarray(table)
-        if np.size(ids) and np.max(ids) >= len(table):
+        table, ids = jnp.asarray(table), checked_ids(ids, what=name)
+        if np.max(ids) >= len(table):
             raise ValueError(
                 f"{name} hold action {np.max(ids)}, and the table describes 0..{len(table) - 1}. "
                 "Encode that action, and give its table."

@@ -31,6 +31,7 @@ from jaxnew.sampling import Actions
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments, plain
 from jaxnew.storage.metrics import MetricsLog, read
+from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import foretold
 from jaxnew.task.domain import Domain, load_task
@@ -311,7 +312,7 @@ def sweep(
     path = Path(workdir or domain.folder(runs) / "-".join(words))
     recorded = {MEMBERS: members}
     with RunDirectory.open_or_create(path, recorded, overwrite, upgrade=upgraded) as directory:
-        print(
+        say(
             f"{len(configs)} members on {len(program.devices)} device(s), {base.num_updates} "
             f"updates each ({foretold(preset, base)}; {len(configs)} times that, less what they "
             f"share) in {path}."

@@ -17,7 +17,9 @@ from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table, is_learned
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.run import Run, load_trainer, locate
+from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import Assignments
+from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageTwoBudget, foretold
 from jaxnew.task.domain import Domain, load_task
@@ -89,10 +91,10 @@ def train(
         check_run(task, trainer.rollout, config.method, np.asarray(trainer.training.table))
         with open_run(path, trainer, overwrite) as directory:
             cost = foretold(preset, config)
-            print(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
+            say(f"Training {title}: {config.num_updates} updates ({cost}) in {path}.")
             result = run_updates(trainer, trainer.init(), directory, title, is_evaluated=True)
     if result.best_metric is not None:
-        print(
+        say(
             f"{path}: update {result.step} of {config.num_updates}; best "
             f"{trainer.selection_metric} {result.best_metric:.3f} at update {result.best_step}."
         )
@@ -119,7 +121,8 @@ def finetune(
     (`docs/method.md`, "Fine-tuning").
 
     Args:
-      source: a run of `train` with the method `ours` or `nearest-neighbour`.
+      source: a run of `train` with the method `ours` or `nearest-neighbour`, or a checkpoint of one
+        (`Run.load`).
       is_scratch: nothing is kept.
       budget, seed, set, overwrite, num_workers: as of `train`.
       workdir: the run directory; default: in that of `source`.
@@ -128,10 +131,10 @@ def finetune(
       UsageError: the source's method has no such continuation, or there is no such budget.
     """
     if not isinstance(source, Run):
-        path, _ = locate(Path(source))
-        trainer = load_trainer(RunDirectory.load(path), num_workers)
+        found = locate(source)
+        trainer = load_trainer(RunDirectory.load(found.path), num_workers)
         _check_continues(trainer.config)  # Runs that cannot go on may have no best checkpoint.
-        source = Run.of(path, trainer, "best")
+        source = Run.of(found.path, trainer, found.kind or "best", found.step)
     config = with_set(finetune_config(source, budget, is_scratch, seed), set)
     table = source.trainer.table
     title = f"finetune-{'scratch' if is_scratch else 'warm'}-{budget}-{config.seed}"
@@ -141,7 +144,7 @@ def finetune(
         if not is_scratch:
             state = _warm_start(state, source, trainer)
         with open_run(path, trainer, overwrite) as directory:
-            print(f"{title}: {config.num_updates} updates with test actions in {path}.")
+            say(f"{title}: {config.num_updates} updates with test actions in {path}.")
             result = run_updates(trainer, state, directory, title, is_evaluated=False)
     run = Run.of(path, trainer, "latest")
     return replace(run, interrupted_by=result.interrupted_by)
@@ -270,8 +273,16 @@ def finetune_config(source: Run, budget_name: str, is_scratch: bool, seed: int) 
         hyperparameters=budget.hyperparameters,
         loop=budget.loop,
         trained_on="test",
-        start="fresh parameters" if is_scratch else f"{old.method}, seed {old.seed}",
+        start="fresh parameters" if is_scratch else _start(source),
     )
+
+
+def _start(source: Run) -> str:
+    """What a run goes on from: the best checkpoint, unless another is named."""
+    words = f"{source.config.method}, seed {source.config.seed}"
+    newest = Checkpointer(source.path / "checkpoints").steps("best")[-1:]
+    is_best = source.checkpoint == "best" and source.step in newest
+    return words if is_best else f"{words}, {source.checkpoint} checkpoint of update {source.step}"
 
 
 def _check_continues(config: TrainConfig) -> None:

@@ -29,7 +29,17 @@ LAYERS = (
     {"loop", "evaluation"},
     {"task"},
     {"checks"},
-    {"recording", "embedding", "trainer", "new_actions", "run", "runs", "training", "sweeping"},
+    {
+        "recording",
+        "embedding",
+        "trainer",
+        "new_actions",
+        "results",
+        "run",
+        "runs",
+        "training",
+        "sweeping",
+    },
 )
 SIDEWAYS = {
     "actions": {"storage.files"},
@@ -38,9 +48,9 @@ SIDEWAYS = {
     "ppo": {"rollout"},
     "embedding": {"recording"},
     "new_actions": {"trainer"},
-    "run": {"embedding", "new_actions", "trainer"},
+    "run": {"embedding", "new_actions", "results", "trainer"},
     "training": {"embedding", "run", "trainer"},
-    "runs": {"run"},
+    "runs": {"results", "run"},
     "sweeping": {"run", "runs", "trainer", "training"},
 }
 

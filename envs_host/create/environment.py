@@ -21,6 +21,7 @@ from envs_host.create.layout import Layout, draw_layout
 from envs_host.create.levels import Level, load_level
 from envs_host.create.tools import Tool, all_tools
 from envs_host.create.world import Placement, World
+from jaxnew.actions import checked_ids
 
 if TYPE_CHECKING:
     from envs_host.create.illustration import RenderOptions
@@ -251,12 +252,10 @@ class CreateEnv(gymnasium.Env):
     def _checked_candidates(self, candidates: Sequence[int] | np.ndarray | None) -> np.ndarray:
         if candidates is None:
             return self.config.action_split().ids(self.config.split_part)
-        ids = np.unique(np.asarray(candidates, np.int32))
-        is_tool = (ids >= 0) & (ids < len(self._tools)) & (ids != self.config.no_op_id)
-        if len(ids) == 0 or len(ids) != len(candidates) or not is_tool.all():
+        ids = np.sort(checked_ids(candidates, len(self._tools), "candidates"))
+        if self.config.no_op_id in ids:
             raise ValueError(
-                f"candidates must be distinct tool ids in 0..{len(self._tools) - 1}, without the "
-                f"no-op {self.config.no_op_id}, which is always available; got {candidates}."
+                f"candidates: the no-op {self.config.no_op_id} is always available; leave it out."
             )
         return ids
 

@@ -9,7 +9,7 @@ from typing import TypeVar
 import jax
 import numpy as np
 
-from jaxnew.actions import ActionUniverse
+from jaxnew.actions import ActionUniverse, read_text
 
 NUM_MOVES = 5
 NUM_SKILLS = 4**NUM_MOVES
@@ -71,7 +71,7 @@ def load_skills(path: Path | str) -> tuple[str, ...]:
     Raises:
       ValueError: the file holds something else, a skill twice, or none.
     """
-    names = tuple(Path(path).read_text().split())
+    names = tuple(read_text(path).split())
     for number, name in enumerate(names):
         wrong = len(name) != NUM_MOVES or set(name) - set(MOVE_NAMES + STAY)
         if wrong or name in names[:number]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from envs_mjx.shape_stacking.hulls import HullTable, hull_table
 from envs_mjx.shape_stacking.solids import CLASS_NAMES, NUM_CLASSES, Solid, solids
-from jaxnew.actions import ActionUniverse
+from jaxnew.actions import ActionUniverse, read_text
 
 DENSITY = 1000.0
 # The published ones, whose ids come first.
@@ -113,19 +113,18 @@ def load_shapes(path: str | Path) -> tuple[Shape, ...]:
       ValueError: it has another header, no shapes, or a line that is none.
     """
     shapes = []
-    with open(path, newline="", encoding="utf-8-sig", errors="replace") as file:
-        lines = csv.reader(file)
-        header = next(lines, [])
-        if tuple(header) != FILE_HEADER:
-            raise ValueError(
-                f"{path}, line 1: the header is {','.join(header)!r} and must be "
-                f"{','.join(FILE_HEADER)!r}."
-            )
-        for line in filter(None, lines):
-            try:
-                shapes.append(_shape(line))
-            except ValueError as err:
-                raise ValueError(f"{path}, line {lines.line_num}: {err}") from err
+    lines = csv.reader(read_text(path).splitlines())
+    header = next(lines, [])
+    if tuple(header) != FILE_HEADER:
+        raise ValueError(
+            f"{path}, line 1: the header is {','.join(header)!r} and must be "
+            f"{','.join(FILE_HEADER)!r}."
+        )
+    for line in filter(None, lines):
+        try:
+            shapes.append(_shape(line))
+        except ValueError as err:
+            raise ValueError(f"{path}, line {lines.line_num}: {err}") from err
     if len(shapes) > MAX_SHAPES:
         raise ValueError(f"{path} has {len(shapes):,} shapes; {MAX_SHAPES:,} are the most.")
     if not shapes:

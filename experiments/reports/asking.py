@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from experiments.reports.runs import RunRecord
-from jaxnew.run import Question, Run
+from jaxnew.results import Question
+from jaxnew.run import Run
+from jaxnew.task.places import check_output
 
 
 @dataclass(frozen=True)
@@ -39,9 +41,11 @@ class Asked:
             record=False,
         )
         (row,) = evaluation.rows.values()
-        run.record(asked.actions, row)
+        metric = run.task.selection_metric
         what = f"{asked.actions} actions, sets of {row['set_size']}"
-        print(f"{run.path}: {what}, done in {row['seconds']} s", flush=True)
+        found = f"{metric} {row['metrics'][metric]['mean']:.4f}, done in {row['seconds']} s"
+        print(f"{run.path}: {what}: {found}", flush=True)
+        run.record(asked.actions, row)
         return dict(row)
 
 
@@ -60,5 +64,6 @@ def answers_of(
     known = [row for row in found if row is not None]
     if len(known) == len(asked):
         return known
+    check_output(record.path / "evaluation", "copy the run to where you may write")
     with Run.load(record.path, "best", num_workers=num_workers) as run:
         return [row or one.evaluate(run, episodes) for one, row in zip(asked, found, strict=True)]

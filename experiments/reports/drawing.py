@@ -179,7 +179,9 @@ def tsne_figure(run: RunRecord, part: str) -> Figure | None:
 def domain_of(run: RunRecord) -> Domain:
     """The domain of a run, with the split that the run kept."""
     config = run.config
-    domain = Domain.of(load_task(config["task"]), config["split"], config["split_seed"])
+    domain = Domain.of(
+        load_task(config["task"], is_recorded=True), config["split"], config["split_seed"]
+    )
     return replace(domain, split=run.split or domain.split)
 
 

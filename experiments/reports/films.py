@@ -5,6 +5,7 @@ They are episodes of `evaluate`; a film that ends otherwise than its episode is 
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,12 +17,13 @@ from PIL import Image
 
 from experiments.reports import plots, tables
 from experiments.reports.plots import Metric
-from experiments.reports.video import write_video
+from experiments.reports.video import check_suffix, write_video
 from jaxnew.rollout.contract import Episode
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.run import Run
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output
 from jaxnew.task.presentation import Film, Filming
+from jaxnew.task.task import Task
 
 SUCCESS, FAILURE = "success", "failure"
 _NUM_COLUMNS = 5
@@ -80,24 +82,26 @@ def film_run(
       The sheet, the table and the films.
 
     Raises:
-      UsageError: the task's episodes cannot be drawn, or not as pages.
-      ImportError: a package that films or pages need is missing.
+      UsageError: the task's episodes cannot be drawn, or not as pages; a package that films need is
+        missing, or nothing can be written there.
       RuntimeError: an episode went another way when it was played again.
     """
     options = options or FilmOptions()
     with Run.load(path, "best", num_workers=num_workers) as run:
-        filming, metric = filming_of(run), run.task.selection_metric
-        if options.with_pages and not filming.has_pages:
-            raise UsageError(f"Task {run.task.name} has no interactive pages; omit --film_pages.")
+        filming, metric = check_films(run.task, options), run.task.selection_metric
+        check_output(out)
         rows, stills, films = [], [], []
-        _clear(out)
-        for episode, film in filmed(run, run.play(count=options.count), options.size):
-            value = episode.metrics[metric]
-            still = Still(episode.number, filming.is_success(value), value, film.frames[-1])
-            stills.append(still)
-            outcome = SUCCESS if still.is_success else FAILURE
-            films.append(_write(out / outcome, episode.number, film, filming, options))
-            rows.append(_row(episode, outcome, films[-1].relative_to(out.parent)))
+        # Films of an earlier call are there until all new ones are.
+        with tempfile.TemporaryDirectory(dir=out, prefix=".new-") as name:
+            for episode, film in filmed(run, run.play(count=options.count), options.size):
+                value = episode.metrics[metric]
+                still = Still(episode.number, filming.is_success(value), value, film.frames[-1])
+                stills.append(still)
+                outcome = SUCCESS if still.is_success else FAILURE
+                file = _write(Path(name) / outcome, episode.number, film, filming, options)
+                films.append(out / outcome / file.name)
+                rows.append(_row(episode, outcome, films[-1].relative_to(out.parent)))
+            _replace_films(out, Path(name))
     table = out.with_suffix(".csv")
     table.write_text(tables.csv_text(rows), encoding="utf-8")
     picture = sheet(stills, title)
@@ -106,15 +110,31 @@ def film_run(
     return [*plots.save(picture, out.with_suffix(".png")), table, *films]
 
 
-def filming_of(run: Run) -> Filming:
-    """How a run's episodes are shown.
+def filming_of(task: Task) -> Filming:
+    """How a task's episodes are shown.
 
     Raises:
       UsageError: they cannot be drawn.
     """
-    if run.task.shown.filming is None:
-        raise UsageError(f"Episodes of task {run.task.name} cannot be filmed.")
-    return run.task.shown.filming
+    if task.shown.filming is None:
+        raise UsageError(f"Episodes of task {task.name} cannot be filmed.")
+    return task.shown.filming
+
+
+def check_films(task: Task, options: FilmOptions) -> Filming:
+    """How a task's episodes are shown, if films of them can be made as they are asked for.
+
+    Raises:
+      UsageError: they cannot.
+    """
+    filming = filming_of(task)
+    if options.with_pages and not filming.has_pages:
+        raise UsageError(f"Task {task.name} has no interactive pages; omit --film_pages.")
+    try:
+        check_suffix(options.suffix)
+    except ImportError as err:
+        raise UsageError(str(err)) from err
+    return filming
 
 
 def filmed(run: Run, episodes: Sequence[Episode], size: int) -> Iterator[tuple[Episode, Film]]:
@@ -124,7 +144,7 @@ def filmed(run: Run, episodes: Sequence[Episode], size: int) -> Iterator[tuple[E
       UsageError: the task's episodes cannot be drawn.
       RuntimeError: one went another way when it was played again.
     """
-    filming, rollout = filming_of(run), run.trainer.rollout
+    filming, rollout = filming_of(run.task), run.trainer.rollout
     place = rollout.env if isinstance(rollout, DeviceRollout) else run.task.environment
     for episode in episodes:
         film = filming.draw(place, episode, size=size)
@@ -147,16 +167,19 @@ def check_film(episode: Episode, film: Film) -> None:
         )
 
 
-def _clear(out: Path) -> None:
-    """Removes films and pictures of an earlier call."""
+def _replace_films(out: Path, new: Path) -> None:
+    """Puts new films and pictures in the place of those of an earlier call."""
     for outcome in (SUCCESS, FAILURE):
         (out / outcome).mkdir(parents=True, exist_ok=True)
         for file in (out / outcome).glob("episode-*"):
             file.unlink()
+        for file in (new / outcome).glob("episode-*"):
+            file.rename(out / outcome / file.name)
 
 
 def _write(folder: Path, number: int, film: Film, filming: Filming, options: FilmOptions) -> Path:
     """An episode's film; beside it its first and last picture and its page. Returns the film."""
+    folder.mkdir(exist_ok=True)
     stem = folder / f"episode-{number:03d}"
     for word, frame in (("start", film.frames[0]), ("end", film.frames[-1])):
         Image.fromarray(frame).save(stem.with_name(f"{stem.name}-{word}.png"))
@@ -195,7 +218,8 @@ def animate_run(
       UsageError: the task's episodes cannot be drawn.
     """
     with Run.load(path, "best") as run:
-        filming, metric = filming_of(run), run.task.selection_metric
+        filming, metric = filming_of(run.task), run.task.selection_metric
+        check_output(out.parent)
         if episode is None:
             played = run.play(part, count=_CANDIDATES)
             number, how = choose([filming.is_success(e.metrics[metric]) for e in played])

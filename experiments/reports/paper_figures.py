@@ -18,7 +18,7 @@ from experiments.reports.drawing import (
     representations_figure,
 )
 from experiments.reports.figure_list import FIGURES, PaperFigure, number_of
-from experiments.reports.films import FilmOptions, film_run
+from experiments.reports.films import FilmOptions, check_films, film_run
 from experiments.reports.finetuning import Tuning, finetune_figure, make_finetuned
 from experiments.reports.jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
 from experiments.reports.production import Cell, Source, find
@@ -34,9 +34,9 @@ from experiments.reports.studies import kind_of, study_runs
 from experiments.reports.study_report import write_study
 from jaxnew.embedding import TABLE_FILE, find_table
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Question
+from jaxnew.results import Question
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, check_output
 from jaxnew.task.task import Task
 
 Setting = tuple[Source, Cell]  # A cell, and where its runs come from.
@@ -79,7 +79,8 @@ def make(
       is_dry: only says what is missing and how long it takes.
 
     Raises:
-      UsageError: there is no such figure, or not for this task; or a run was stopped.
+      UsageError: there is no such figure, or not for this task, or its files cannot be written; or
+        a run was stopped.
     """
     task = source.domain.task
     chosen = list(dict.fromkeys(number_of(number, task.name) for number in numbers))
@@ -92,12 +93,16 @@ def make(
         if FIGURES[number].kind == "finetune":
             tuned.append(Tuning(settings[0][0], options.finetune_steps).seconds)
     jobs = unique_jobs(jobs)
+    out = out or source.domain.folder(source.folder) / "figures"
+    if not is_dry:
+        check_output(out)
+        if any(FIGURES[number].kind == "films" for number in work):
+            check_films(task, options.films)
     announce(jobs, episodes, evaluation_seconds(source, episodes), tuned)
     if is_dry:
         return []
     for job in jobs:
         job.run()
-    out = out or source.domain.folder(source.folder) / "figures"
     return [
         file for number, settings in work.items() for file in draw(number, settings, out, options)
     ]
@@ -245,7 +250,7 @@ def added_to(
     names = {shown_as(source.domain.task) for source, _ in settings}
     runs = read_runs(paths)
     for run in runs:
-        name = shown_as(load_task(run.config["task"]))
+        name = shown_as(load_task(run.config["task"], is_recorded=True))
         if name not in names:
             raise UsageError(
                 f"{run.path} is a run of {name}; the figure shows {', '.join(sorted(names))}."

@@ -102,7 +102,7 @@ class Source:
             budget=flags.budget,
             stage_one=flags.representation_budget or flags.budget,
             steps=flags.steps,
-            seeds=tuple(map(int, flags.seeds)),
+            seeds=tuple(flags.seeds),
             assignments=tuple(flags.set),
             given=given or {},
             workers=flags.workers,

@@ -13,6 +13,8 @@ from experiments.reports.paper import PaperValue, paper_steps, paper_value
 from experiments.reports.plots import Metric
 from experiments.reports.runs import Group, RunRecord
 from jaxnew.actions import SPLIT_NAMES
+from jaxnew.evaluation import EVALUATION_SEED
+from jaxnew.results import question_of
 
 RANDOM_PLAY = "random-play"  # What `demo` records in place of a checkpoint.
 
@@ -26,6 +28,7 @@ class ResultRow:
       task, method, representation: of the runs.
       actions: what the sets were drawn from: train, validation, test, ...
       checkpoint, policy, set_size: what was evaluated, and on how many actions.
+      evaluation_seed: of the episodes.
       is_standard: evaluated as the paper does: sampled actions of the checkpoint that was chosen by
         validation, on sets of the paper's size.
       metric: the episode metric.
@@ -49,6 +52,7 @@ class ResultRow:
     checkpoint: str
     policy: str
     set_size: int
+    evaluation_seed: int
     is_standard: bool
     metric: str
     mean: float
@@ -74,9 +78,7 @@ def result_rows(group: Group) -> list[ResultRow]:
     for run in group.runs:
         for e in run.evaluations:
             if group.task.selection_metric in e["metrics"]:
-                grows = e.get("first_size", 0), e.get("growth", 0)
-                key = e["actions"], e["checkpoint"], e["policy"], e["set_size"], *grows
-                found.setdefault(key, []).append((run, e))
+                found.setdefault(question_of(e), []).append((run, e))
     order = ("train", "validation", "test")
     rows = [_result_row(group, evaluations) for evaluations in found.values()]
     return sorted(
@@ -112,6 +114,7 @@ def _result_row(group: Group, evaluations: list[tuple[RunRecord, dict[str, Any]]
         checkpoint=first["checkpoint"],
         policy=first["policy"],
         set_size=first["set_size"],
+        evaluation_seed=first.get("evaluation_seed", EVALUATION_SEED),
         is_standard=is_standard(group, first),
         metric=group.task.selection_metric,
         mean=mean,
@@ -181,6 +184,8 @@ def _cells(row: ResultRow, metric: Metric) -> list[str]:
     if row.num_seeds > 1:
         error = f"± {metric.text(row.high - row.mean)}"
     paper = difference = "-"
+    is_usual = row.evaluation_seed == EVALUATION_SEED
+    policy = f"{row.policy}, {row.checkpoint}{f', seed {row.evaluation_seed}' * (not is_usual)}"
     seeds, steps = str(row.num_seeds), "-" if is_random else f"{1e-6 * row.trained_steps:.3g}"
     if row.paper_mean is not None and row.paper_std is not None and row.paper_steps is not None:
         paper = f"{metric.text(row.paper_mean)} ± {metric.text(row.paper_std)}"
@@ -190,7 +195,7 @@ def _cells(row: ResultRow, metric: Metric) -> list[str]:
     return [
         row.setting,
         f"{row.actions}, sets of {row.set_size}",
-        "random play" if is_random else f"{row.policy}, {row.checkpoint}",
+        "random play" if is_random else policy,
         f"{metric.text(row.mean)} {error}",
         *(paper, difference, seeds),
         f"{row.num_episodes:,}",

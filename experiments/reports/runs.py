@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import pairwise
@@ -25,15 +25,14 @@ from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.finiteness import CAUSES, cause_of
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Question
+from jaxnew.results import Question, on_record
 from jaxnew.runs import is_sweep
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.config import differences, plain
 from jaxnew.storage.metrics import read
-from jaxnew.storage.run_directory import RunDirectory, RunDirectoryError
-from jaxnew.task.domain import load_task
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.places import UsageError
-from jaxnew.task.settings import upgraded
+from jaxnew.task.settings import recorded_task, upgraded
 from jaxnew.task.task import Task
 
 # Fields that tell settings of one method and representation apart in a label, most telling first.
@@ -70,16 +69,12 @@ class RunRecord:
 
     @cached_property
     def evaluations(self) -> list[dict[str, Any]]:
-        """What `Run.evaluate` recorded.
+        """What `Run.evaluate` recorded of its checkpoints as they are now.
 
         Raises:
           RunDirectoryError: a file is damaged.
         """
-        found = RunDirectory.load(self.path).evaluations()
-        played = {name: e for name, e in found.items() if "actions" in e and "metrics" in e}
-        for name, evaluation in played.items():
-            _check_intervals(self.path / "evaluation" / f"{name}.json", evaluation["metrics"])
-        return list(played.values())
+        return on_record(self.path)
 
     @cached_property
     def table(self) -> RepresentationTable | None:
@@ -269,18 +264,6 @@ def _read_run(path: Path) -> RunRecord:
     return RunRecord(path, upgraded(config))
 
 
-def _check_intervals(file: Path, metrics: Mapping[str, Mapping[str, Any]]) -> None:
-    """Raises unless every mean lies in its interval, but for what rounding does."""
-    for name, value in metrics.items():
-        low, mean, high = (float(value.get(key, np.nan)) for key in ("low", "mean", "high"))
-        slack = 1e-6 * (1.0 + abs(mean))
-        if not low - slack <= mean <= high + slack:
-            raise RunDirectoryError(
-                f"{file} is damaged: the mean of {name}, {mean:g}, is not in its interval "
-                f"[{low:g}, {high:g}]. Restore it from a copy, or move it away and evaluate again."
-            )
-
-
 def policies(paths: Sequence[Path]) -> list[RunRecord]:
     """Those of `read_runs` that are of policies.
 
@@ -314,7 +297,7 @@ def group_runs(runs: Sequence[RunRecord]) -> list[Group]:
                 )
         first = members[0]
         label = f"{first.config['method']}, {first.representation}"
-        groups.append(Group(label, load_task(first.config["task"]), tuple(members)))
+        groups.append(Group(label, recorded_task(first.config), tuple(members)))
     return with_distinct_labels(groups)
 
 

@@ -18,7 +18,8 @@ from jaxnew.actions import ActionIdentity, ActionSplit
 from jaxnew.embedding import Encoder
 from jaxnew.recording import collect
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Question, Run
+from jaxnew.results import Question
+from jaxnew.run import Run
 from jaxnew.task.places import UsageError
 from jaxnew.task.presentation import ActionStudy
 from jaxnew.task.settings import read_train_config, with_settings
@@ -141,7 +142,8 @@ def _recordings(encoder: Path | None, record: RunRecord, value: float) -> Asked:
     def table(run: Run) -> dict[str, Any]:
         return {"table": encoded_test_actions(encoder, run.split, int(value))}
 
-    return Asked(Question(f"recordings-{int(value)}", _usual(record)), table)
+    name = f"recordings-{int(value)}-{Encoder.load(encoder).table.hash[:8]}"
+    return Asked(Question(name, _usual(record)), table)
 
 
 def _own_study(name: str, study: ActionStudy, record: RunRecord, value: float) -> Asked:

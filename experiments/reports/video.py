@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -29,8 +30,7 @@ def write_video(frames: Sequence[np.ndarray], path: Path, frame_ms: int = 60) ->
       ValueError: no frame, another suffix, or frames that do not fit together.
       ImportError: MP4 without imageio and its ffmpeg.
     """
-    if path.suffix not in SUFFIXES:
-        raise ValueError(f"{path} must end in one of {', '.join(SUFFIXES)}.")
+    check_suffix(path.suffix)
     if len({frame.shape for frame in frames}) != 1:
         raise ValueError(
             f"A video needs frames of one size; got {len(frames)} frames of sizes "
@@ -39,6 +39,30 @@ def write_video(frames: Sequence[np.ndarray], path: Path, frame_ms: int = 60) ->
     path.parent.mkdir(parents=True, exist_ok=True)
     (_write_gif if path.suffix == ".gif" else _write_mp4)(frames, path, frame_ms)
     return path
+
+
+def check_suffix(suffix: str) -> None:
+    """Raises unless videos with that suffix can be made here.
+
+    Raises:
+      ValueError: it is none of `SUFFIXES`.
+      ImportError: MP4 without imageio and its ffmpeg.
+    """
+    if suffix not in SUFFIXES:
+        raise ValueError(f"The name of a video ends in {' or '.join(SUFFIXES)}, not {suffix!r}.")
+    if suffix == ".mp4":
+        _imageio()
+
+
+def _imageio() -> Any:
+    """The package that writes MP4."""
+    try:
+        importlib.import_module("imageio_ffmpeg")  # Found by imageio itself.
+        return importlib.import_module("imageio.v2")
+    except ImportError as err:
+        raise ImportError(
+            f"MP4 needs more packages ({err}); pip install 'jaxnew[video]', or make GIFs."
+        ) from err
 
 
 def _write_gif(frames: Sequence[np.ndarray], path: Path, frame_ms: int) -> None:
@@ -59,14 +83,7 @@ def _write_gif(frames: Sequence[np.ndarray], path: Path, frame_ms: int) -> None:
 
 
 def _write_mp4(frames: Sequence[np.ndarray], path: Path, frame_ms: int) -> None:
-    try:
-        imageio = importlib.import_module("imageio.v2")
-        importlib.import_module("imageio_ffmpeg")  # Found by imageio itself.
-    except ImportError as err:
-        raise ImportError(
-            f"MP4 needs more packages ({err}); pip install 'jaxnew[video]', or write a .gif."
-        ) from err
     height, width = (side // _BLOCK * _BLOCK for side in frames[0].shape[:2])
-    with imageio.get_writer(path, fps=1000.0 / frame_ms, macro_block_size=_BLOCK) as writer:
+    with _imageio().get_writer(path, fps=1000.0 / frame_ms, macro_block_size=_BLOCK) as writer:
         for frame in frames:
             writer.append_data(frame[:height, :width])

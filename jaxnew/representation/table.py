@@ -14,6 +14,7 @@ from jaxnew.actions import (
     ActionSplit,
     ActionUniverse,
     SplitMismatch,
+    checked_ids,
     content_hash,
 )
 from jaxnew.storage.arrays import read_arrays
@@ -220,14 +221,9 @@ def _checked_vectors(vectors: np.ndarray) -> np.ndarray:
 
 def _checked_ids(ids: np.ndarray, num_rows: int) -> np.ndarray:
     """`ids` as int32[num_rows], each once and not negative."""
-    if ids.shape != (num_rows,) or ids.dtype.kind not in "iu":
+    if ids.shape != (num_rows,):
         raise ValueError(
             f"ids must be {num_rows} integers, one per row of vectors; got {ids.dtype} of shape "
             f"{ids.shape}."
         )
-    if ids.min() < 0 or ids.max() > np.iinfo(np.int32).max:
-        raise ValueError(f"ids span {ids.min()}..{ids.max()}; an action id is a small number >= 0.")
-    values, counts = np.unique(ids, return_counts=True)
-    if len(values) != num_rows:
-        raise ValueError(f"ids names action {values[counts > 1][0]} twice; list each id once.")
-    return ids.astype(np.int32)
+    return checked_ids(ids)

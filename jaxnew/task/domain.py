@@ -11,7 +11,7 @@ from typing import Any
 
 from jaxnew.actions import ActionSplit, ActionUniverse
 from jaxnew.task.budgets import StageOneBudget
-from jaxnew.task.places import UsageError, budget_of, load_place
+from jaxnew.task.places import UsageError, budget_of, import_recorded, load_place
 from jaxnew.task.task import Play, Task
 
 # Packages that bring tasks name a module for each in this group of entry points.
@@ -100,19 +100,26 @@ def published(make: Callable[[], ActionSplit]) -> Callable[[ActionUniverse, int]
     return of_seed
 
 
-def load_task(name: str) -> Task:
+def load_task(name: str, *, is_recorded: bool = False) -> Task:
     """A task by name (`grid_world`, `create-push`) or by place (`package.module:TASK`).
 
     Names are those of the entry points `jaxnew.tasks` of what is installed. Such a module defines
     `TASK` and, for several tasks of one domain, `TASKS`, a mapping from the part of the name after
     the dash.
 
+    Args:
+      name: see above.
+      is_recorded: a run names it, not the user; see `import_recorded`.
+
     Raises:
-      UsageError: there is no such module or object, or it is not a `Task`.
+      UsageError: there is no such module or object, or it is not a `Task`; or a run names a module
+        that is neither installed nor trusted.
     """
     known = _installed()
     allowed = f"Tasks: {', '.join(sorted(known))}; or give package.module:TASK for one of your own."
     if ":" in name:
+        if is_recorded:
+            import_recorded(name)
         return _checked(load_place(name, f"task {name!r}", allowed), name, allowed, place=name)
     base, _, variant = name.partition("-")
     if base not in known:

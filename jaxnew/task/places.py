@@ -1,14 +1,23 @@
-"""Things that are found by name or by place: tasks, methods, budgets."""
+"""Things that are found by name or by place: tasks, methods, budgets; and places for output."""
 
 from __future__ import annotations
 
+import contextlib
 import difflib
 import importlib
-from collections.abc import Mapping
+import importlib.metadata
+import importlib.util
+import sys
+import tempfile
+from collections.abc import Iterator, Mapping
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
+from jaxnew.storage.progress import say
+
 Budget = TypeVar("Budget")
+_TRUSTS: ContextVar[bool] = ContextVar("trusts", default=False)
 
 
 class UsageError(ValueError):
@@ -44,6 +53,44 @@ def load_place(place: str, what: str, allowed: str) -> Any:
     return getattr(module, attribute)
 
 
+@contextlib.contextmanager
+def trusting(trust: bool = True) -> Iterator[None]:
+    """Within, `import_recorded` imports whatever is named, if `trust`."""
+    token = _TRUSTS.set(trust or _TRUSTS.get())
+    try:
+        yield
+    finally:
+        _TRUSTS.reset(token)
+
+
+def import_recorded(place: str) -> None:
+    """Imports the module of `package.module:NAME` that a run names, and says so.
+
+    To import is to run, and somebody else may have written the run: what is neither installed nor
+    imported already, as by whoever named it himself, has to be trusted.
+
+    Raises:
+      UsageError: it is not.
+    """
+    module = place.partition(":")[0]
+    top = module.partition(".")[0]
+    if module in sys.modules or not top.isidentifier():
+        return
+    spec = importlib.util.find_spec(top)
+    if spec is None:
+        return  # Whoever needs it says that it is missing.
+    origin = spec.origin or ", ".join(spec.submodule_search_locations or ())
+    is_installed = {*sys.stdlib_module_names, *importlib.metadata.packages_distributions()}
+    if top not in is_installed and not _TRUSTS.get():
+        raise UsageError(
+            f"The run names {place}, which is not installed; it would be imported from {origin}, "
+            "and thereby run. If you know what it does: --trust (trust=True)."
+        )
+    say(f"Importing {module}, which the run names, from {origin}.")
+    with contextlib.suppress(ModuleNotFoundError):
+        importlib.import_module(module)
+
+
 def file_of(name: str, allowed: str) -> Path:
     """The file called `name`, with its whole path.
 
@@ -51,8 +98,44 @@ def file_of(name: str, allowed: str) -> Path:
       UsageError: there is none; it says what is `allowed`.
     """
     path = Path(name).expanduser().resolve()
-    if not path.is_file():
-        raise UsageError(f"There is no file {name!r}. {allowed}")
+    try:
+        if path.is_file():
+            return path
+    except OSError as err:  # Such as a name that is too long.
+        raise UsageError(f"{name!r} is no file ({err.strerror}). {allowed}") from err
+    raise UsageError(f"There is no file {name!r}. {allowed}")
+
+
+def check_output(folder: Path | str, instead: str = "choose another folder") -> Path:
+    """The folder, which is made if absent: before work is done whose result goes there.
+
+    Args:
+      instead: what to do where nothing can be written, for the message.
+
+    Raises:
+      UsageError: nothing can be written there.
+    """
+    folder = Path(folder)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError as err:
+        raise UsageError(
+            f"Nothing can be written in {folder} ({err.strerror}); {instead}."
+        ) from err
+
+
+def check_output_file(path: Path | str) -> Path:
+    """`check_output` of a file: of the folder that it is to lie in.
+
+    Raises:
+      UsageError: nothing can be written there, or `path` is a folder.
+    """
+    path = Path(path)
+    if path.is_dir():
+        raise UsageError(f"{path} is a folder; give the name of a file in it.")
+    check_output(path.parent)
     return path
 
 

@@ -15,6 +15,7 @@ from jaxnew.storage import config as config_lib
 from jaxnew.storage.config import Assignments, ConfigError
 from jaxnew.task.budgets import LoopConfig
 from jaxnew.task.domain import load_task
+from jaxnew.task.places import import_recorded
 from jaxnew.task.task import Task
 
 # How a run is computed; no part of what it is.
@@ -209,8 +210,11 @@ def read_train_config(
       UsageError: there is no such task.
     """
     if "ppo" not in plain or "task" not in plain:
-        raise ConfigError("This is no run of a policy: its config has no ppo and task.")
-    task = task or load_task(plain["task"])
+        raise ConfigError(
+            "This is no run of a policy: its config has no ppo and task. Give a run of train, "
+            "finetune or sweep; those of embed are for --representation."
+        )
+    task = recorded_task(plain, task)
     pool = None if task.host is None else task.host.pool_settings
     config = config_lib.from_dict(
         train_config_type(task), {**upgraded(plain), COMPUTED: config_lib.plain(pool)}
@@ -223,6 +227,17 @@ def read_train_config(
             "it."
         )
     return config, task
+
+
+def recorded_task(plain: Mapping[str, Any], task: Task | None = None) -> Task:
+    """The task that a run's config names, unless it is given; its method is imported as well.
+
+    Raises:
+      UsageError: there is no such task, or see `import_recorded`.
+    """
+    if ":" in str(plain.get("method")):
+        import_recorded(plain["method"])
+    return task or load_task(plain["task"], is_recorded=True)
 
 
 def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
@@ -239,7 +254,7 @@ def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
         new["sets"] = {name: rollout.pop(old) for old, name in names.items()}
         new["ppo"] = {**new["ppo"], "rollout": rollout}
     if isinstance(new["environment"], list):  # And settings of the environment were texts.
-        settings = load_task(new["task"]).environment
+        settings = load_task(new["task"], is_recorded=True).environment
         if settings is not None:
             texts = [text.removeprefix("environment.") for text in new["environment"]]
             settings = config_lib.set_paths(settings, texts)

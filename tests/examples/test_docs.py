@@ -11,7 +11,7 @@ import pytest
 
 from examples.kicks import PLAY
 from jaxnew.embedding import Encoder
-from tests.experiments.commands import ROOT, read_json, run
+from tests.experiments.commands import ROOT, evaluation, read_json, run
 
 DOCS = sorted(ROOT.glob("docs/**/*.md"))
 PAGES = sorted(ROOT.glob("docs/your_own_*.md"))
@@ -112,7 +112,7 @@ def test_the_domain_from_recordings_to_unseen_actions(
     assert "300 actions x 8 recordings" in output
     path = runs / "kicks" / "ours-hvae-default-smoke-31"
     assert read_json(path / "config.json")["task"] == TASK_PLACE
-    result = read_json(path / "evaluation" / "test-best-sampled-m20.json")
+    result = evaluation(path, "test-best-sampled-m20")
     assert (result["num_actions"], result["num_episodes"]) == (75, 64)
     assert {"is_success", "is_off_table", "episode_length"} <= set(result["metrics"])
     # The encoder of new actions is found again as well.
@@ -122,7 +122,7 @@ def test_the_domain_from_recordings_to_unseen_actions(
     run_script(page, runs, monkeypatch)
     said = capsys.readouterr().out
     assert said.count("already complete") == 2
-    assert re.search(r"test \(32 episodes, sampled\): .*is_success", said)
+    assert re.search(r"32 sampled episodes each; .*\n +is_success .*\n(.+\n)*test ", said)
 
 
 @pytest.mark.integration
@@ -135,8 +135,8 @@ def test_the_policy_is_found_again(
     path = runs / "kicks" / "examples-attention_policy-AttentionMethod-hvae-default-smoke-31"
     config = read_json(path / "config.json")
     assert (config["task"], config["method"]) == (TASK_PLACE, METHOD_PLACE)
-    result = read_json(path / "evaluation" / "test-best-sampled-m20.json")
+    result = evaluation(path, "test-best-sampled-m20")
     assert (result["num_actions"], result["num_episodes"]) == (75, 64)
     run_script(page, runs, monkeypatch)
     said = capsys.readouterr().out
-    assert re.search(r"test \(32 episodes, sampled\): .*is_success", said)
+    assert re.search(r"32 sampled episodes each; .*\n +is_success .*\n(.+\n)*test ", said)

@@ -127,6 +127,12 @@ def of_new_actions(section: str, runs: Path, paths: Mapping[str, Path]) -> list[
     return [line.split()[1:] for line in block.splitlines()]
 
 
+def evaluation(path: Path, words: str) -> Any:
+    """What is on record in a run's directory under these words, behind which is a hash."""
+    (file,) = (path / "evaluation").glob(f"{words}-{'[0-9a-f]' * 8}.json")
+    return read_json(file)
+
+
 def read_json(path: Path) -> Any:
     """What a JSON file holds."""
     return json.loads(path.read_text())

@@ -19,7 +19,7 @@ from experiments.tasks.grid_world import TASK
 from jaxnew.actions import ActionSplit
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run import file_stem
+from jaxnew.results import file_stem
 from jaxnew.storage import config as config_lib
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.metrics import MetricsLog

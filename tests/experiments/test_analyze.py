@@ -19,7 +19,7 @@ from jaxnew.actions import ActionSplit
 from jaxnew.embedding import Encoder
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import run, run_alone
+from tests.experiments.commands import evaluation, run, run_alone
 from tests.experiments.several import run_several
 
 POLICY = "ours-hvae-relative-default-smoke-31"
@@ -59,20 +59,19 @@ def test_sizes_ratios_growth_and_recordings(runs: Path) -> None:
         name = study.replace("-", "_")
         assert (runs / "analysis" / f"{name}.png").stat().st_size > 5000
         found[study] = [float(row["mean"]) for row in rows_of(runs / "analysis" / f"{name}.csv")]
-    files = {path.name for path in (runs / POLICY / "evaluation").iterdir()}
-    assert {
-        "test-best-sampled-m10.json",
-        "test-best-sampled-m50.json",
-        "unseen-0-best-sampled-m50.json",
-        "test-best-sampled-m50-from5-by5.json",
-        "recordings-1-best-sampled-m50.json",
-    } <= files
+    encoder = Encoder.load(runs / ENCODER).table.hash[:8]
+    for words in (
+        "test-best-sampled-m10",
+        "test-best-sampled-m50",
+        "unseen-0-best-sampled-m50",
+        "test-best-sampled-m50-from5-by5",
+        f"recordings-1-{encoder}-best-sampled-m50",  # Another encoder is another question.
+    ):
+        assert evaluation(runs / POLICY, words)["num_episodes"] == 128
     # The whole set from the start, all recordings, or only unseen actions: the same evaluation.
     whole = found["set-size"][1]
     assert (found["growing-set"][1], found["recordings"][0]) == (whole, whole)
-    stored = json.loads(
-        (runs / POLICY / "evaluation" / "unseen-1-best-sampled-m50.json").read_text()
-    )
+    stored = evaluation(runs / POLICY, "unseen-1-best-sampled-m50")
     assert stored["num_actions"] == 256
     assert found["unseen-ratio"][1] == whole
 

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -16,9 +18,11 @@ from jaxnew.actions import SplitMismatch
 from jaxnew.embedding import find_table
 from jaxnew.observations import ObservationsError
 from jaxnew.representation.table import RepresentationTable
+from jaxnew.rollout.device import DeviceRollout
+from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import refused, run, run_alone
+from tests.experiments.commands import ROOT, command_line, refused, run, run_alone
 
 pytestmark = pytest.mark.integration
 
@@ -175,6 +179,92 @@ def test_bad_id_files(policy_run: Path, tmp_path: Path) -> None:
         jobs.append((f"--run={policy_run}", f"--ids={file}", "--episodes=8"))
     for says, output in zip(contents.values(), refused("evaluate", jobs), strict=True):
         assert says in output[-500:]
+
+
+NOWHERE = "/proc/nowhere"  # Nobody can make it, root neither.
+LONG = "/tmp/" + "x" * 300
+PATHS: list[tuple[str, tuple[str, ...], str]] = [
+    ("evaluate", ("--run={run}", "--ids=/nowhere/ids.txt"), "There is no file '/nowhere/ids.txt'"),
+    ("evaluate", ("--run={run}", f"--ids={LONG}"), "is no file (File name too long). --ids takes"),
+    ("evaluate", (f"--run={LONG}",), f"{LONG}/config.json: File name too long. Give a path"),
+    ("evaluate", ("--run={run}", f"--output={NOWHERE}"), f"Nothing can be written in {NOWHERE}"),
+    ("evaluate", ("--run={run}/typo",), "typo is no checkpoint of"),
+    ("evaluate", ("--run={run}/checkpoints/best", "--checkpoint=latest"), "not a latest one"),
+    ("evaluate", ("--run=",), "--run is empty; give a value, or leave it out"),
+    ("evaluate", ("--run=~/nothing-is-here",), f"{Path.home()}/nothing-is-here is neither"),
+    ("finetune", ("--run={run}/typo",), "typo is no checkpoint of"),
+    ("figures", ("--run={run}", f"--out={NOWHERE}"), f"Nothing can be written in {NOWHERE}"),
+    ("figures", ("--run={run}", "--seeds=a"), "flag --seeds=a: invalid literal"),
+    (
+        "figures",
+        ("--figure=8", f"--out={NOWHERE}", "--task=create-push", "--budget=smoke"),
+        "Nothing",
+    ),
+    ("analyze", ("--study=set-size", "--run={run}", f"--out={NOWHERE}"), "Nothing can be written"),
+    (
+        "analyze",
+        ("--study=set-size", "--run={run}", "--values=1,b"),
+        "flag --values=1,b: could not",
+    ),
+    ("anchors", (f"--out={NOWHERE}", "--episodes=8"), f"Nothing can be written in {NOWHERE}"),
+    ("contact_sheets", (f"--out={NOWHERE}",), f"Nothing can be written in {NOWHERE}"),
+    ("train", ("--budget=smoke", f"--representation={LONG}.npz"), "File name too long"),
+]
+
+
+@pytest.mark.parametrize(("command", "flags", "says"), PATHS)
+def test_paths_are_checked_before_work_starts(
+    policy_run: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    command: str,
+    flags: tuple[str, ...],
+    says: str,
+) -> None:
+    """What was given and what to do, in one line, and no episode was played for it."""
+    monkeypatch.setattr(DeviceRollout, "measure", None)
+    before = sorted(policy_run.rglob("*"))
+    output = run(command, *(flag.format(run=policy_run) for flag in flags), fails=True)
+    assert says in output
+    assert len(output.splitlines()) == 1 + ("shows where" in output), output
+    assert sorted(policy_run.rglob("*")) == before
+
+
+def test_an_encoder_is_no_policy(tmp_path: Path) -> None:
+    RunDirectory.open_or_create(tmp_path / "encoder", {"model": {}, "task": "grid_world"}).close()
+    output = run("evaluate", f"--run={tmp_path / 'encoder'}", fails=True)
+    assert f"{tmp_path / 'encoder'}: This is no run of a policy" in output
+    assert "those of embed are for --representation" in output
+
+
+def test_names_of_files_may_be_any_and_results_lie_elsewhere(
+    policy_run: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The names have blanks and umlauts; the home of the user is written as shells write it."""
+    monkeypatch.setenv("HOME", str(tmp_path))
+    (tmp_path / "my ids ü.txt").write_text("\ufeff" + " ".join(map(str, range(60))), "utf-8")
+    before = sorted(policy_run.rglob("*"))
+    flags = ("--ids=~/my ids ü.txt", "--output=~/kept", "--episodes=8")
+    output = run("evaluate", f"--run={policy_run}", *flags)
+    assert "ids-my ids ü  " in output
+    (file,) = (tmp_path / "kept").iterdir()
+    assert file.name.startswith("ids-my-ids-")
+    assert json.loads(file.read_text())["run"] == str(policy_run)
+    assert sorted(policy_run.rglob("*")) == before
+
+
+def test_what_a_command_prints_ends_nothing(policy_run: Path) -> None:
+    """Behind a pipe that nobody reads, on a terminal of few letters, without a home."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    done = subprocess.run(
+        command_line("evaluate", f"--run={policy_run}", "--help"),
+        cwd=ROOT,
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        check=False,
+    )
+    os.close(writer)
+    assert (done.returncode, done.stderr) == (0, b"")
 
 
 def test_flags_of_another_mode_are_refused(policy_run: Path, tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ from tests.experiments.commands import (
     ENVIRONMENT,
     ROOT,
     command_line,
+    evaluation,
     of_new_actions,
     read_json,
     run,
@@ -78,7 +79,7 @@ def evaluated(hvae_run: Path) -> tuple[str, dict[str, Any]]:
     """What `evaluate` printed and found; then, in another process, it is run in several ways."""
     flags = (f"--run={hvae_run}", "--sets=train,test", "--episodes=96")
     output = run("evaluate", *flags)
-    file = hvae_run / "evaluation" / "test-best-sampled-m50.json"
+    (file,) = (hvae_run / "evaluation").glob("test-best-sampled-m50-*.json")
     first = read_json(file)
     file.unlink()
     ids_file = hvae_run.parent / "chosen.txt"
@@ -94,12 +95,12 @@ def test_evaluate_in_a_new_process_and_twice_the_same(
     hvae_run: Path, evaluated: tuple[str, dict[str, Any]]
 ) -> None:
     output, first = evaluated
-    assert "test (96 episodes, sampled)" in output
+    assert re.search(r"96 sampled episodes each; .*\n +is_success .*\ntrain .*\ntest  ", output)
     assert first["num_episodes"] == 96
     assert first["num_actions"] == 256
     success = first["metrics"]["is_success"]
     assert success["low"] <= success["mean"] <= success["high"]
-    second = read_json(hvae_run / "evaluation" / "test-best-sampled-m50.json")
+    second = evaluation(hvae_run, "test-best-sampled-m50")
     assert second["metrics"] == first["metrics"]
 
 
@@ -107,9 +108,9 @@ def test_evaluate_on_a_checkpoint_ids_a_mixture_and_greedily(
     hvae_run: Path, evaluated: tuple[str, dict[str, Any]]
 ) -> None:
     assert evaluated
-    found = read_json(hvae_run / "evaluation" / "ids-chosen-latest-greedy-m50.json")
+    found = evaluation(hvae_run, "ids-chosen-????????-latest-greedy-m50")
     assert (found["num_actions"], found["checkpoint"]) == (60, "latest")
-    found = read_json(hvae_run / "evaluation" / "unseen-0.5-best-sampled-m20.json")
+    found = evaluation(hvae_run, "unseen-0.5-best-sampled-m20")
     assert (found["num_actions"], found["set_size"]) == (128 + 256, 20)
 
 
@@ -135,7 +136,7 @@ def test_new_actions_are_recorded_encoded_and_acted_with(
     assert "100 actions, 16 numbers each" in outputs[1]
     first = (ROOT / "examples" / "skills.txt").read_text().split()[0]
     assert f"100 actions of GridWorld-v0, 0 seen in training, e.g. {first}; " in outputs[2]
-    found = read_json(hvae_run / "evaluation" / "table-new_skills_table-best-sampled-m50.json")
+    found = evaluation(hvae_run, "table-new_skills_table-????????-best-sampled-m50")
     assert (found["num_actions"], found["num_seen"], found["num_episodes"]) == (100, 0, 32)
     table = RepresentationTable.load(runs / "new_skills_table.npz")
     assert table.ids.tolist() == list(range(1024, 1124))
@@ -260,21 +261,20 @@ def test_a_sweep_is_read_back_and_its_members_are_ordinary_runs(runs: Path) -> N
         assert name == f"entropy_coefficient={entropy}-seed={seed}"
     last = path / "members" / names[3]
     run("evaluate", f"--run={last}", "--episodes=32")
-    alone = last / "evaluation" / "test-best-sampled-m50.json"
-    before = read_json(alone)["metrics"]
+    before = evaluation(last, "test-best-sampled-m50")["metrics"]
     # As `train` reports: a line per chunk of two updates.
     assert [line["step"] for line in metrics.read(last) if "loss/total" in line] == [2, 4]
     assert "| entropy_coefficient | validation/is_success | by validation |" in output
     output = run("evaluate", f"--run={path}", "--sets=train,test", "--episodes=32")
     header = "| entropy_coefficient | validation/is_success | test-best-sampled-m50 | train-best-"
     assert header in output
-    assert read_json(alone)["metrics"] == before  # Alone and in turn.
+    assert evaluation(last, "test-best-sampled-m50")["metrics"] == before  # Alone and in turn.
     with (path / "figures" / "sweep.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert [row["entropy_coefficient"] for row in rows] == ["0.0", "0.1"]
     for row, members in zip(rows, (names[:2], names[2:]), strict=True):
-        files = [path / "members" / m / "evaluation" / alone.name for m in members]
-        means = [read_json(file)["metrics"]["is_success"]["mean"] for file in files]
+        found = [evaluation(path / "members" / m, "test-best-sampled-m50") for m in members]
+        means = [each["metrics"]["is_success"]["mean"] for each in found]
         assert float(row["test-best-sampled-m50"]) == pytest.approx(np.mean(means))
         assert row["test-best-sampled-m50_seeds"] == "2"
     assert header in run("figures", f"--run={path}")

@@ -13,7 +13,7 @@ import pytest
 
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
-from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json
+from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, evaluation, read_json
 from tests.experiments.create_runs import saved, timeless
 from tests.experiments.several import run_several
 
@@ -108,10 +108,7 @@ def test_without_the_setting_a_dead_worker_ends_the_run(outputs: dict[str, str])
 
 def test_evaluations_are_equal_to_the_bit(stopped: Path, evaluated: dict[str, str]) -> None:
     assert [text.count("killed in-evaluation") for text in evaluated.values()] == [0, 0, 1]
-    found = [
-        read_json(stopped.parent / name / "evaluation" / "test-best-sampled-m5.json")
-        for name in evaluated
-    ]
+    found = [evaluation(stopped.parent / name, "test-best-sampled-m5") for name in evaluated]
     assert found[0]["num_episodes"] == 12
     assert found[0]["metrics"]["num_steps"]["mean"] > 1.0
     for other in found[1:]:

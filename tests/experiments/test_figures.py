@@ -203,7 +203,7 @@ def test_a_figure_is_made_stopped_and_finished(
         ("no-subsampling", "test", "20"),
     ]
     assert rows[0]["paper_method"] == "ours"
-    evaluations = list(folder.rglob("evaluation/test-best-sampled-m20.json"))
+    evaluations = list(folder.rglob("evaluation/test-best-sampled-m20-*.json"))
     assert len(evaluations) == 3
     mean = json.loads(evaluations[0].read_text())["metrics"]["is_success"]["mean"]
     assert mean in [float(row["mean"]) for row in rows]

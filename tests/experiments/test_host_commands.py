@@ -16,7 +16,15 @@ from jaxnew.run import Run
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.task import Task
-from tests.experiments.commands import ENVIRONMENT, ROOT, command_line, read_json, run, run_alone
+from tests.experiments.commands import (
+    ENVIRONMENT,
+    ROOT,
+    command_line,
+    evaluation,
+    read_json,
+    run,
+    run_alone,
+)
 from tests.experiments.create_runs import saved, timeless
 from tests.toy_task import TASK
 
@@ -41,7 +49,7 @@ def test_train_save_and_evaluate_in_a_new_process(trained: Path) -> None:
     results = []
     for evaluate in (run, run_alone):
         evaluate("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7")
-        results.append(read_json(trained / "evaluation" / "test-best-sampled-m4.json"))
+        results.append(evaluation(trained, "test-best-sampled-m4"))
     assert results[0]["metrics"] == results[1]["metrics"]
     assert (results[0]["num_actions"], results[0]["num_episodes"]) == (6, 7)
     assert set(results[0]["metrics"]) == {"is_success", "episode_return", "num_steps"}
@@ -70,7 +78,7 @@ def test_a_method_with_a_fixed_set_trains_and_is_evaluated(tmp_path: Path) -> No
     method = "--method=nearest-neighbour"
     run("train", *COMMON, method, "--set=num_updates=1", f"--workdir={tmp_path / 'run'}")
     run("evaluate", f"--run={tmp_path / 'run'}", "--episodes=3")
-    assert read_json(tmp_path / "run" / "evaluation" / "test-best-sampled-m4.json")["metrics"]
+    assert evaluation(tmp_path / "run", "test-best-sampled-m4")["metrics"]
 
 
 def test_a_killed_run_resumes_to_the_same_bits(trained: Path, tmp_path: Path) -> None:

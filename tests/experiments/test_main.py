@@ -3,14 +3,21 @@
 from __future__ import annotations
 
 import importlib
+import os
 import re
 import signal
+import subprocess
+import sys
+from pathlib import Path
 from typing import Any
 
+import jax
 import pytest
 from absl import flags
 
+from experiments import flags as flags_module
 from experiments import main
+from experiments.flags import configure_jax
 from experiments.main import COMMANDS
 
 pytestmark = pytest.mark.unit
@@ -35,7 +42,8 @@ def test_one_process_imports_every_command() -> None:
     """So none defines a flag that another has, or one for all."""
     for name in COMMANDS:
         assert callable(command(name).main)
-        assert "debug_nans" in command(name).ARGUMENTS._values
+        computes = name != "contact_sheets"
+        assert ("debug_nans" in command(name).ARGUMENTS._values) == computes
     of_all = flags.FLAGS.flags_by_module_dict()
     ours = ("experiments", "jaxnew", "envs_host", "envs_mjx", "__main__")
     assert [module for module in of_all if module.startswith(ours)] == []
@@ -112,3 +120,77 @@ def test_a_second_command_line_starts_from_the_defaults() -> None:
     assert (arguments.seed, len(arguments.set), arguments.is_given("seed")) == (7, 2, True)
     arguments.parse(["--stderrthreshold=fatal"])  # One of absl's, which are legal as well.
     assert (arguments.seed, arguments.set, arguments.is_given("seed")) == (31, [], False)
+
+
+def test_the_user_s_variables_win(monkeypatch: pytest.MonkeyPatch) -> None:
+    names = ("jax_compilation_cache_dir", "jax_persistent_cache_min_compile_time_secs")
+    found: dict[str, Any] = {}
+    monkeypatch.setattr(jax.config, "update", found.__setitem__)
+    for name in names:
+        monkeypatch.delenv(name.upper(), raising=False)
+    configure_jax()
+    assert set(found) == set(names)
+    found.clear()
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "/mine")
+    configure_jax()
+    assert set(found) == {names[1]}
+
+    def homeless(cls: type[Path]) -> Path:
+        raise RuntimeError("Could not determine home directory.")
+
+    found.clear()
+    monkeypatch.delenv("JAX_COMPILATION_CACHE_DIR")
+    monkeypatch.setattr(Path, "home", classmethod(homeless))
+    configure_jax()
+    assert set(found) == {names[1]}
+
+
+@pytest.mark.parametrize(("flag", "inside"), [("--nodebug_nans", False), ("--debug_nans", True)])
+@pytest.mark.parametrize("own", [False, True])
+def test_debug_nans_adds_to_what_the_user_set(flag: str, inside: bool, own: bool) -> None:
+    """And reaches the commands that a command starts."""
+    seen: list[bool] = []
+
+    def look() -> None:
+        seen.append(jax.config.jax_debug_nans)
+        seen.append("JAX_DEBUG_NANS" in main.child("train")[1])
+
+    with jax.debug_nans(own):
+        command("train").ARGUMENTS.start(look, [flag])
+        assert jax.config.jax_debug_nans == own
+    assert seen == [own or inside] * 2
+
+
+@pytest.mark.parametrize(
+    ("word", "meant"),
+    [
+        ("--run=~/a,~/b", "--run=/home/me/a,/home/me/b"),
+        ("--run=~", "--run=/home/me"),
+        ("--given=hvae=~/t.npz", "--given=hvae=/home/me/t.npz"),
+        ("--run=a~/b", "--run=a~/b"),
+        ("--run=/a/~/b", "--run=/a/~/b"),
+        ("~/a", "~/a"),  # Shells do this one.
+    ],
+)
+def test_home_is_where_shells_have_it(
+    word: str, meant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("HOME", "/home/me")
+    arguments = command("figures").ARGUMENTS
+    assert flags_module._at_home(word) == meant
+    arguments.parse(["--run=~/a,b~", "--given=hvae=~/t.npz"])
+    assert arguments.run == ["/home/me/a", "b~"]
+    assert arguments.given == ["hvae=/home/me/t.npz"]
+
+
+def test_a_notebook_s_backend_does_not_reach_the_figures() -> None:
+    """Its name is that of a backend which another installation lacks."""
+    done = subprocess.run(
+        [sys.executable, "-c", "import experiments.reports.plots as p; p.new_figure(1, 1)"],
+        cwd=Path(main.__file__).parents[1],
+        env={**os.environ, "MPLBACKEND": "of-another-installation"},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")

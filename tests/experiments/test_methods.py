@@ -11,7 +11,7 @@ from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import OPTIMIZED, read_json, run, run_alone
+from tests.experiments.commands import OPTIMIZED, evaluation, read_json, run, run_alone
 from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
@@ -58,7 +58,7 @@ def evaluated(runs: Path) -> Path:
 
 def check_evaluations(path: Path, sizes: tuple[int, int]) -> None:
     for part, size in zip(("train", "test"), sizes, strict=True):
-        result = read_json(path / "evaluation" / f"{part}-best-sampled-m{size}.json")
+        result = evaluation(path, f"{part}-best-sampled-m{size}")
         assert result["set_size"] == size
         assert result["num_episodes"] == 32
 

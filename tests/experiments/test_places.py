@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,8 @@ from experiments.reports.production import Cell, Source
 from jaxnew.policy import UtilityMethod
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import adapted, file_name, method_of, variant_of
-from jaxnew.task.places import UsageError
+from jaxnew.task.places import UsageError, trusting
+from jaxnew.task.settings import recorded_task
 
 pytestmark = pytest.mark.unit
 
@@ -148,3 +150,36 @@ def test_a_module_that_lacks_a_library_says_so() -> None:
     for load in (load_task, variant_of):
         with pytest.raises(ModuleNotFoundError, match="some_library_that_is_not_here"):
             load("someones_broken_module:X")
+
+
+@pytest.mark.parametrize("place", ["task", "method"])
+def test_what_a_run_names_is_imported_when_it_is_trusted(
+    place: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """To import is to run: a module in the folder where one is may be somebody else's."""
+    name = {"task": "someones_module:TASK", "method": "someones_module:Policy"}[place]
+    plain = {"task": "grid_world", "method": "ours", place: name}
+    monkeypatch.delitem(sys.modules, "someones_module", raising=False)
+    with pytest.raises(UsageError, match=f"names {name}, which is not installed.*--trust"):
+        recorded_task(plain)
+    assert "someones_module" not in sys.modules
+    assert capsys.readouterr().out == ""
+    with trusting():
+        assert recorded_task(plain).name in ("mine", "grid_world")
+    assert "Importing someones_module, which the run names, from " in capsys.readouterr().out
+    assert "someones_module" in sys.modules
+    recorded_task(plain)  # It has run already.
+    assert capsys.readouterr().out == ""
+
+
+def test_installed_modules_and_those_that_the_user_names_are_trusted(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delitem(sys.modules, "experiments.tasks.grid_world")
+    assert load_task("experiments.tasks.grid_world:TASK", is_recorded=True).name == "grid_world"
+    assert "Importing experiments.tasks.grid_world, which" in capsys.readouterr().out
+    monkeypatch.delitem(sys.modules, "someones_module", raising=False)
+    assert load_task("someones_module:TASK").name == "mine"
+    assert load_task("someones_module:TASK", is_recorded=True).name == "mine"
+    with pytest.raises(UsageError, match="no module no_such_module"):
+        load_task("no_such_module:X", is_recorded=True)

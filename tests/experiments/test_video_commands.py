@@ -22,7 +22,7 @@ from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from tests import video_task
-from tests.experiments.commands import read_json, run, run_alone
+from tests.experiments.commands import evaluation, read_json, run, run_alone
 
 PLACE = "--task=tests.video_task:TASK"
 COMMON = (PLACE, "--representation=hvae-video", "--budget=smoke")
@@ -64,7 +64,7 @@ def test_a_policy_that_sees_videos_is_evaluated_in_a_new_process(runs: Path) -> 
     table = RepresentationTable.load(runs / TOY / ENCODER / "table.npz")
     assert (config["representation"], config["table_hash"]) == ("hvae-video", table.hash)
     run_alone("evaluate", f"--run={policy}", "--sets=test", "--episodes=5")
-    found = read_json(policy / "evaluation" / "test-best-sampled-m4.json")
+    found = evaluation(policy, "test-best-sampled-m4")
     assert found["num_episodes"] == 5
 
 

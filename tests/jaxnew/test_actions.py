@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,17 +12,22 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from envs_mjx.grid_world import skill_universe
+from envs_mjx.grid_world import GridWorld, skill_universe
+from jaxnew import observations
 from jaxnew.actions import (
     SPLIT_NAMES,
     ActionSplit,
     ActionUniverse,
     SplitMismatch,
+    checked_ids,
     content_hash,
     load_ids,
     mixture_ids,
     random_halves_split,
 )
+from jaxnew.environment import FixedActionSet
+from jaxnew.representation.table import RepresentationTable
+from jaxnew.sampling import ActionPool, Actions
 
 PARTS = (*SPLIT_NAMES, "always_available")
 
@@ -218,14 +224,14 @@ def test_split_sorts_its_ids_and_hashes_membership() -> None:
     ],
 )
 def test_split_refuses_an_id_in_two_places(changes: dict) -> None:
-    with pytest.raises(ValueError, match=r"Action \d is in both \w+ and \w+; each id .* once"):
+    with pytest.raises(ValueError, match=r"Action \d is in both \w+ and|stands there twice"):
         split_of(**changes)
 
 
 @pytest.mark.unit
 @pytest.mark.parametrize("changes", [{"train": []}, {"validation": []}, {"test": [[5, 6]]}])
 def test_split_refuses_empty_and_nested_parts(changes: dict) -> None:
-    with pytest.raises(ValueError, match=rf"{next(iter(changes))} must be .*, got shape \("):
+    with pytest.raises(ValueError, match=rf"{next(iter(changes))}: must be .* of shape \("):
         split_of(**changes)
 
 
@@ -257,7 +263,7 @@ def test_check_names_both_universes() -> None:
 @pytest.mark.parametrize("action_id", [-1, 20])
 def test_check_refuses_ids_that_do_not_exist(part: str, action_id: int) -> None:
     """JAX clamps out-of-range reads silently, so this is the only place that notices."""
-    with pytest.raises(ValueError, match=rf"{part}.*{action_id}.*0\.\.19"):
+    with pytest.raises(ValueError, match=rf"{part}.*{action_id}.*0\.\.(19|2147483647)"):
         split_of(**{part: [10, action_id]}).check(UNIVERSE)
 
 
@@ -390,11 +396,11 @@ def test_ids_are_read_in_order_from_any_list(tmp_path: Path, text: str) -> None:
         (" ,\n", r"ids\.txt holds no action id"),
         ("1 two 3", r"ids\.txt .*integer.*'two'"),
         ("1 2.0", r"ids\.txt .*integer.*'2\.0'"),
-        ("1 20", r"ids\.txt names action 20; toy has 0\.\.19"),
-        ("-1", r"ids\.txt names action -1; toy has 0\.\.19"),
+        ("1 20", r"ids\.txt, ids of toy: action 20 is not in 0\.\.19"),
+        ("-1", r"ids\.txt, ids of toy: action -1 is not in 0\.\.19"),
         # Larger than an int32.
-        ("99999999999", r"ids\.txt names action 99999999999; toy has 0\.\.19"),
-        ("4 7 4", r"ids\.txt names .*4.* twice; list each id once"),
+        ("99999999999", r"ids\.txt, ids of toy: action 99999999999 is not in 0\.\.19"),
+        ("4 7 4", r"ids\.txt, .* action 4 stands there twice; list each id once"),
     ],
 )
 def test_bad_lists_are_refused_with_what_is_wrong(tmp_path: Path, text: str, message: str) -> None:
@@ -402,3 +408,49 @@ def test_bad_lists_are_refused_with_what_is_wrong(tmp_path: Path, text: str, mes
     path.write_text(text)
     with pytest.raises(ValueError, match=message):
         load_ids(path, UNIVERSE)
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize(
+    ("ids", "message"),
+    [
+        ([1.0, 2.0], "must be a non-empty list of integers, got float64"),
+        ([True, False], "must be a non-empty list of integers, got bool"),
+        (["1"], "must be a non-empty list of integers, got <U1"),
+        ([[1, 2]], r"must be a non-empty list of integers, got int64 of shape \(1, 2\)"),
+        ([-1], r"action -1 is not in 0\.\."),
+        ([2**33], r"action 8589934592 is not in 0\.\."),
+        ([4, 7, 4], "action 4 stands there twice"),
+    ],
+)
+def test_what_is_no_list_of_ids_is_refused_wherever_python_takes_one(
+    ids: list[object], message: str
+) -> None:
+    """Float ids were cut to integers, and true and false were actions 1 and 0."""
+    takes: list[Callable[[np.ndarray], object]] = [
+        checked_ids,
+        lambda ids: ActionSplit(ids, np.array([18]), np.array([19]), UNIVERSE.hash),
+        lambda ids: Actions.of(np.zeros((20, 2), np.float32), ids, 1),
+        lambda ids: ActionPool.of(ids, capacity=20),
+        lambda ids: FixedActionSet(GridWorld(), ids),
+        lambda ids: RepresentationTable(np.zeros((len(ids), 2), np.float32), ids),
+        lambda ids: observations.checked_ids(ids, None, "mine.npz"),
+    ]
+    for take in takes:
+        is_matrix = np.ndim(ids) == 2 and take == takes[5]  # Of another length than the vectors.
+        with pytest.raises(ValueError, match="one per row" if is_matrix else message):
+            take(np.array(ids))
+
+
+@pytest.mark.unit
+def test_text_files_have_one_encoding(tmp_path: Path) -> None:
+    """Some editors write a mark before it, or another one; that one is refused by its name."""
+    path = tmp_path / "ids.txt"
+    path.write_bytes(b"\xef\xbb\xbf1 2")
+    assert load_ids(path, UNIVERSE).tolist() == [1, 2]
+    for encoding in ("utf-16", "utf-16-be", "latin-1"):
+        path.write_bytes("1 2 ü".encode(encoding))
+        with pytest.raises(
+            ValueError, match=r"ids\.txt (is no UTF-8 text .* save it as UTF-8|must)"
+        ):
+            load_ids(path, UNIVERSE)

@@ -292,11 +292,11 @@ def test_other_settings_are_named(tmp_path: Path, changes: dict[str, Any], text:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"ids": np.zeros(0, np.int32)}, "non-empty vector of integers"),
-        ({"ids": np.array([0.5])}, "non-empty vector of integers, got float64"),
-        ({"ids": np.array([0, NUM_ACTIONS])}, r"ids span 0\.\.23; legal are 0\.\.22"),
-        ({"ids": np.array([-1])}, "ids span -1"),
-        ({"ids": np.array([3, 3])}, "listed twice"),
+        ({"ids": np.zeros(0, np.int32)}, "non-empty list of integers"),
+        ({"ids": np.array([0.5])}, "non-empty list of integers, got float64"),
+        ({"ids": np.array([0, NUM_ACTIONS])}, r"action 23 is not in 0\.\.22"),
+        ({"ids": np.array([-1])}, "action -1 is not in"),
+        ({"ids": np.array([3, 3])}, "stands there twice"),
         ({"num_recordings": 0}, "must be at least 1"),
         ({"block_actions": 0}, "must be at least 1"),
     ],

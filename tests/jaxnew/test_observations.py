@@ -94,10 +94,10 @@ def good_arrays() -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changes", "text"),
     [
-        ({"ids": np.array([1, 1])}, "listed twice"),
+        ({"ids": np.array([1, 1])}, "stands there twice"),
         ({"ids": np.array([1])}, "has shape"),
-        ({"ids": np.array([-4, 2])}, "ids span -4"),
-        ({"ids": np.array(["a", "b"])}, "vector of integers"),
+        ({"ids": np.array([-4, 2])}, "ids: action -4 is not in 0"),
+        ({"ids": np.array(["a", "b"])}, "list of integers"),
         ({"recordings": np.zeros((2, 2, 9), np.uint8)}, r"expected \(2, 2, 3, 2\)"),
         ({"recordings": np.zeros((2, 0, 3, 2), np.uint8)}, r"expected \[2, S"),
         ({"recordings": np.zeros((2, 2, 3, 2), np.float64)}, "has dtype float64"),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -11,10 +13,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.actions import ActionIdentity, SplitMismatch, mixture_ids
+from jaxnew.actions import ActionIdentity, SplitMismatch, content_hash, mixture_ids
 from jaxnew.evaluation import measure, summarize
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run import Evaluation, Run, locate
+from jaxnew.results import Evaluation, Question, on_record
+from jaxnew.run import Run, locate
 from jaxnew.storage.checkpoint import CheckpointError
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.run_directory import RunDirectory, RunDirectoryError
@@ -28,6 +31,7 @@ pytestmark = pytest.mark.integration
 LADDER = toy_device.TASK
 UNIVERSE = Domain.of(LADDER).universe
 TABLE = engineered_table(UNIVERSE, "gt3")
+MINE = np.array([1, 2, 3, 4])
 
 
 @pytest.fixture(scope="module")
@@ -39,8 +43,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
 
 
 def results(run: Run) -> dict[str, Any]:
-    """What is in the run's directory, by file."""
-    return RunDirectory.load(run.path).evaluations()
+    """What is in the run's directory, by file without the hash behind its words."""
+    found = RunDirectory.load(run.path).evaluations()
+    return {re.sub(r"-[0-9a-f]{8}$", "", name): content for name, content in found.items()}
 
 
 def test_a_run_is_loaded_from_its_directory_or_a_checkpoint(run: Run) -> None:
@@ -50,16 +55,38 @@ def test_a_run_is_loaded_from_its_directory_or_a_checkpoint(run: Run) -> None:
     assert run.trainer.table.hash == TABLE.hash
     latest = Run.load(str(run.path), "latest")
     assert (latest.checkpoint, latest.step) == ("latest", 4)
-    folder = next((run.path / "checkpoints" / "latest").iterdir())
-    assert Run.load(folder).checkpoint == "latest"
-    assert Run.load(folder, "best").checkpoint == "best"
-    assert Run.load(run.path / "evaluation").checkpoint == "best"
-    assert locate(run.path / "checkpoints" / "latest") == (run.path, "latest")
+    assert Run.load(run.path / "checkpoints" / "latest").step == 4
     assert Run.load(run.path, task=replace(LADDER, name="other")).task.name == "other"
 
 
+def test_exactly_the_checkpoint_that_is_named(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A step is that step, an absent one is none, and a folder of a run is not the run."""
+    folder = run.path / "checkpoints" / "latest"
+    second = folder / "000000000002"
+    assert locate(folder) == (run.path, "latest", None)
+    assert locate(second) == (run.path, "latest", 2)
+    found = Run.load(second)
+    assert (found.checkpoint, found.step) == ("latest", 2)
+    monkeypatch.chdir(second)
+    assert locate(".") == (run.path, "latest", 2)
+    (tmp_path / "link").symlink_to(second)
+    assert locate(tmp_path / "link") == (run.path, "latest", 2)
+    with pytest.raises(UsageError, match=r"is a latest checkpoint, not a best one"):
+        Run.load(second, "best")
+    inside = ("typo", "evaluation", "checkpoints", "config.json", "checkpoints/last")
+    absent = ("checkpoints/latest/000000000077", "checkpoints/latest/000000000002/state")
+    for name in (*inside, *absent):
+        with pytest.raises(
+            UsageError, match=r"is no checkpoint of .*: checkpoints/best/0000"
+        ) as err:
+            Run.load(run.path / name)
+        assert "checkpoints/latest/000000000002, checkpoints/latest/000000000004" in str(err.value)
+
+
 def test_what_is_no_run_is_refused(run: Run, tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="is neither a run directory nor in one"):
+    with pytest.raises(UsageError, match="is neither a run directory nor a checkpoint in one"):
         Run.load(tmp_path)
     with pytest.raises(ConfigError, match=r"only pool\.FIELD=value can be set"):
         Run.load(run.path, set={"num_updates": 3})
@@ -100,15 +127,9 @@ def test_numbers_are_those_of_the_rollout_and_are_kept(run: Run) -> None:
             "evaluation_seed": 2020,
         }
         assert {key: row[key] for key in row if key != "metrics"} == expected
-        recorded = results(run)[f"{name}-best-sampled-m4"]
-        assert recorded.pop("seconds") == seconds
-        assert recorded == {"checkpoint": "best", "step": run.step, "actions": name, **row}
-    text = str(found)
-    assert text.splitlines()[0] == (
-        f"{run.path}, best checkpoint (update {run.step}); mean [95 % interval over episodes]"
-    )
-    success = found.rows["test"]["metrics"]["is_success"]
-    assert f"is_success {success['mean']:.4f} [{success['low']:.4f}, {success['high']:.4f}]" in text
+        kept = results(run)[f"{name}-best-sampled-m4"]
+        assert kept.pop("seconds") == seconds
+        assert kept == {"checkpoint": "best", "step": run.step, "actions": name, **row}
 
 
 def test_whoever_asks_otherwise_gets_a_file_of_its_own(run: Run) -> None:
@@ -119,7 +140,7 @@ def test_whoever_asks_otherwise_gets_a_file_of_its_own(run: Run) -> None:
         {"set_size": 3},
         {"grows_from": 1, "growth": 2},
         {"parts": "validation"},
-        {"ids": {"mine": np.array([1, 2, 3, 4])}},
+        {"ids": {"mine": MINE}},
         {"unseen_ratio": 0.5},
     )
     for arguments in asked:
@@ -129,7 +150,7 @@ def test_whoever_asks_otherwise_gets_a_file_of_its_own(run: Run) -> None:
         "test-best-sampled-m3",
         "test-best-sampled-m4-from1-by2",
         "validation-best-sampled-m4",
-        "mine-best-sampled-m4",
+        f"mine-{content_hash(MINE)[:8]}-best-sampled-m4",
         "unseen-0.5-best-sampled-m4",
     }
     grown = results(run)["test-best-sampled-m4-from1-by2"]
@@ -143,6 +164,72 @@ def test_whoever_asks_otherwise_gets_a_file_of_its_own(run: Run) -> None:
     assert set(results(run)) - set(here) == {"test-latest-sampled-m4"}
 
 
+def test_different_questions_have_different_files(run: Run, tmp_path: Path) -> None:
+    """Also where they differ in a seed, a number of episodes, an update or other ids alone."""
+    earlier = Run.load(run.path / "checkpoints" / "latest" / "000000000002")
+    latest = Run.load(run.path, "latest")
+    asked: tuple[tuple[Run, dict[str, Any]], ...] = (
+        (latest, {}),
+        (latest, {"seed": 1}),
+        (latest, {"episodes": 5}),
+        (earlier, {}),
+        (latest, {"ids": {"my ids, ä/ö": MINE}}),
+        (latest, {"ids": {"my ids, ä/ö": MINE + 1}}),
+        (latest, {"ids": {"x" * 300: MINE}}),
+    )
+    for number, (of_run, arguments) in enumerate(asked, 1):
+        of_run.evaluate(**{"episodes": 4, **arguments}, record=tmp_path / "kept")
+        assert len(list((tmp_path / "kept").iterdir())) == number
+    latest.evaluate(episodes=4, record=str(tmp_path / "kept"))
+    assert len(list((tmp_path / "kept").iterdir())) == len(asked), "the same question again"
+    (file,) = (tmp_path / "kept").glob("test-latest-sampled-m4-seed1-*.json")
+    assert json.loads(file.read_text())["run"] == str(run.path)
+
+
+def test_what_is_on_record_is_of_the_checkpoint_as_it_is_now(run: Run, tmp_path: Path) -> None:
+    copy = tmp_path / "copy"
+    shutil.copytree(run.path, copy, ignore=shutil.ignore_patterns("*.json"))
+    for name in ("config.json", "provenance.json", "split.json"):
+        shutil.copy(run.path / name, copy)
+    again, question = Run.load(copy), Question("test", 4)
+    again.evaluate(episodes=4)
+    again.evaluate(episodes=6)
+    again.evaluate(episodes=5)
+    (best,) = on_record(copy)
+    assert question.is_answered_by(best, 6), "the answer with most episodes"
+    again.acting_as(again.policy, "other").evaluate(episodes=4)
+    replace(again, step=again.step - 1).evaluate(episodes=9)
+    assert [e["checkpoint"] for e in on_record(copy)] == ["best", "other"]
+    # Another validation has made another checkpoint the best.
+    steps = copy / "checkpoints" / "best"
+    (steps / f"{again.step:012d}").rename(steps / f"{again.step + 1:012d}")
+    assert [e["checkpoint"] for e in on_record(copy)] == ["other"]
+    # Until 0.2.0 there was one file for all episodes and seeds.
+    old = {**best, "step": again.step + 1}
+    (copy / "evaluation" / "test-best-sampled-m4.json").write_text(json.dumps(old))
+    assert [question.is_answered_by(e) for e in on_record(copy)] == [False, True]
+
+
+def test_where_nothing_can_be_recorded_nothing_is_played(
+    run: Run, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    before = results(run)
+    with monkeypatch.context() as patch:
+        patch.setattr(type(run), "_row", None)
+        with pytest.raises(UsageError, match=r"Nothing can be written in .*file.*record elsewhere"):
+            run.evaluate(episodes=4, record=tmp_path / "file" / "folder")
+    assert results(run) == before
+
+    def full(*args: object) -> None:
+        raise OSError(28, "No space left on device", "x.json")
+
+    monkeypatch.setattr("jaxnew.run.write_json_atomically", full)
+    found = run.evaluate(["train", "test"], episodes=4, record=tmp_path)
+    assert list(found.rows) == ["train", "test"]
+    assert "test is not on record: [Errno 28] No space left on device" in str(found)
+
+
 def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
     ids = np.array([3, 8, 20, 21], np.int32)
     vectors = np.random.default_rng(0).normal(size=(4, 3)).astype(np.float32)
@@ -151,10 +238,12 @@ def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
         vectors, ids, source="new", encoder_hash=TABLE.hash, identity=identity
     )
     found = run.evaluate(table=table, episodes=6)
-    assert list(found.rows) == [f"table-{table.hash[:8]}"]
-    assert f"table-{table.hash[:8]}-best-sampled-m4" in results(run)
+    digest = content_hash(table.hash, UNIVERSE.name)[:8]
+    assert list(found.rows) == [f"table-{digest}"]
+    assert f"table-{digest}-best-sampled-m4" in results(run)
     named = run.evaluate(table=table, table_name="new", episodes=6, greedy=True)
     assert list(named.rows) == ["table-new"]
+    assert f"table-new-{digest}-best-greedy-m4" in results(run)
     whole = np.array(run.trainer.training.table)
     whole[ids] = vectors
     actions = run.trainer.actions("new", ids, vectors=jnp.asarray(whole))
@@ -181,6 +270,10 @@ def test_new_actions_are_drawn_and_represented_by_their_table(run: Run) -> None:
         ({"seed": 2**32}, ConfigError, "seed of the evaluation=4294967296 must be an integer"),
         ({"seed": True}, ConfigError, "seed of the evaluation=True must be an integer"),
         ({"unseen_ratio": 1.5}, ValueError, "1.5"),
+        ({"ids": {}}, UsageError, "ids are lists by name"),
+        ({"ids": [1, 2, 3]}, UsageError, "ids are lists by name"),
+        ({"ids": {"test": np.arange(5)}}, UsageError, "names of parts of the split"),
+        ({"ids": {"mine": np.arange(5.0)}}, ValueError, "the mine actions: must be .* float64"),
     ],
 )
 def test_what_cannot_be_evaluated(
@@ -209,8 +302,10 @@ def test_another_policy_is_recorded_under_its_name(run: Run) -> None:
     other = run.acting_as(Run.load(run.path, "latest").policy, "mean of two")
     assert (other.checkpoint, other.path) == ("mean of two", run.path)
     assert isinstance(other.evaluate(episodes=4, record=False), Evaluation)
-    path = run.acting_as(run.policy, "again").record("test", {"policy": "sampled", "set_size": 4})
-    assert path == run.path / "evaluation" / "test-again-sampled-m4.json"
+    path = run.acting_as(run.policy, "a b").record("test", {"policy": "sampled", "set_size": 4})
+    assert path.parent == run.path / "evaluation"
+    assert re.fullmatch("test-a-b-sampled-m4-[0-9a-f]{8}.json", path.name)
+    path.unlink()
 
 
 def test_a_run_on_the_host_ends_its_processes(tmp_path: Path) -> None:

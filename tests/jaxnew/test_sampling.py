@@ -210,9 +210,9 @@ def test_a_pool_holds_its_members_and_valid_padding() -> None:
 @pytest.mark.parametrize(
     ("ids", "always", "message"),
     [
-        ([], [], "at least one"),
-        ([4, 4], [], "distinct"),
-        ([4], [4], "at least one"),
+        ([], [], "non-empty"),
+        ([4, 4], [], "action 4 stands there twice"),
+        ([4], [4], "more than the always available"),
         ([1, 2, 3, 4], [], "4 ids do not fit a pool of capacity 3"),
     ],
 )
@@ -395,9 +395,9 @@ def test_a_growing_set_is_the_beginning_of_the_whole_one() -> None:
 def test_actions_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match=r"Sets of 8 .* from the test actions, .* 7 \(0 "):
         Actions.of(TABLE, IDS, 8, name="the test actions")
-    with pytest.raises(ValueError, match="distinct ids"):
+    with pytest.raises(ValueError, match="action 4 stands there twice"):
         Actions.of(TABLE, np.array([4, 4]), 1)
-    with pytest.raises(ValueError, match="distinct ids and at least one"):
+    with pytest.raises(ValueError, match="must be a non-empty list of integers"):
         Actions.of(TABLE, np.zeros(0, np.int32))
     with pytest.raises(ValueError, match=r"hold action 30, .* describes 0\.\.29"):
         Actions.of(TABLE, np.arange(31), 2)

@@ -159,6 +159,12 @@ def test_fine_tuning_learns_test_actions_in_the_run(trained: Run) -> None:
         strict=True,
     ):
         np.testing.assert_array_equal(one, other)
+    # From another checkpoint it is another run.
+    named = trained.path / "checkpoints" / "latest" / "000000000004"
+    with pytest.raises(
+        ConfigMismatch, match="'ours, seed 31, latest checkpoint of update 4' asked"
+    ):
+        finetune(named, budget="smoke", seed=5)
     scratch = finetune(trained.path, is_scratch=True, budget="smoke", seed=5)
     assert scratch.path == trained.path / "finetune-scratch-smoke-5"
     assert scratch.config.start == "fresh parameters"

@@ -9,6 +9,7 @@ from importlib import resources
 from pathlib import Path
 
 from envs_host.create.levels.schema import Level, LevelError, read_level
+from jaxnew.actions import read_text
 
 TASK_NAMES = (
     "Push",
@@ -125,7 +126,7 @@ def _read_file(path: Path) -> Level:
             f"{path} is no file; give a level's name {level_names()} or its JSON file."
         )
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except (OSError, UnicodeDecodeError) as err:
+        text = read_text(path)
+    except (OSError, ValueError) as err:
         raise LevelError(f"{path} cannot be read as text: {err}.") from err
     return parse_level(text, str(path))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -91,8 +92,12 @@ def test_a_film_of_another_end_is_refused(
         return Film([np.zeros((size, size, 3), np.uint8)], other)
 
     monkeypatch.setattr(films, "filming_of", lambda run: Filming(draw))
+    old = tmp_path / "out" / "success" / "episode-000.gif"
+    old.parent.mkdir(parents=True)
+    old.write_text("a film of an earlier call")
     with pytest.raises(RuntimeError, match=r"Episode 0 ended with .* when it was played again"):
         film_run(toy, tmp_path / "out", options=FilmOptions(1, 16), num_workers=1)
+    assert list((tmp_path / "out").rglob("*.*")) == [old], "it is there until there is another"
 
 
 @pytest.mark.integration
@@ -292,7 +297,10 @@ def test_animation_of_a_checkpoint(tmp_path: Path, capsys: pytest.CaptureFixture
 
 
 @pytest.mark.unit
-def test_what_cannot_be_filmed(tmp_path: Path) -> None:
+def test_what_cannot_be_filmed_is_said_before_it_is_played(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Run, "play", None)
     shop = untrained(tmp_path / "shop", "recommender", "product")
     with pytest.raises(UsageError, match="Episodes of task recommender cannot be filmed"):
         film_run(shop, tmp_path / "out")
@@ -301,4 +309,9 @@ def test_what_cannot_be_filmed(tmp_path: Path) -> None:
     grid = untrained(tmp_path / "grid", "grid_world", "gt12")
     with pytest.raises(UsageError, match="grid_world has no interactive pages"):
         film_run(grid, tmp_path / "out", options=FilmOptions(1, with_pages=True))
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(UsageError, match=r"pip install 'jaxnew\[video\]'"):
+        film_run(grid, tmp_path / "out", options=FilmOptions(1, suffix=".mp4"))
     assert not (tmp_path / "out").exists()
+    with pytest.raises(UsageError, match="Nothing can be written in /proc/nowhere"):
+        film_run(grid, Path("/proc/nowhere"), options=FilmOptions(1))

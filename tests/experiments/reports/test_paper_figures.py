@@ -314,7 +314,7 @@ def test_bars_and_a_study_of_runs_that_are_made_on_the_host(
         *("figure_9c.png", "figure_9c.md", "figure_9c.csv"),
     ]
     found = {
-        file.name.removesuffix("-best-sampled-m4.json"): read_json(file)["metrics"]["is_success"]
+        file.name.partition("-best-sampled-m4-")[0]: read_json(file)["metrics"]["is_success"]
         for file in (run / "evaluation").iterdir()
     }
     assert set(found) == {"train", "test", "goodness-0", "goodness-0.5", "goodness-1"}

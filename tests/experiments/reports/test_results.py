@@ -14,7 +14,7 @@ from experiments.reports.production import Cell
 from experiments.reports.results import as_markdown, result_rows
 from experiments.reports.runs import read_runs
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.run import Question
+from jaxnew.results import Question
 from jaxnew.storage.run_directory import RunDirectory
 from tests.experiments.handwritten import (
     config_of,
@@ -57,6 +57,26 @@ def test_one_run_has_its_interval_and_its_distance_from_the_paper(tmp_path: Path
     assert "75.0 [73.0, 76.0] | 79.7 ± 2.5 | -4.7 | 1 / 8 | 1,000 | 0.00154 / 40 |" in markdown
     assert "| random play | 0.3 [" in markdown
     assert "A note." in markdown
+
+
+@pytest.mark.unit
+def test_a_question_has_one_row_and_another_seed_of_episodes_is_another(tmp_path: Path) -> None:
+    path = write_run(tmp_path / "run", plain_config())
+    write_evaluation(path, "test", 0.75)
+    for episodes in range(100, 900, 100):
+        write_evaluation(path, "test", 0.5, num_episodes=episodes)
+    write_evaluation(path, "test", 0.25, evaluation_seed=7)
+    (group,) = groups_at(path)
+    usual, other = result_rows(group)
+    assert (usual.mean, usual.num_episodes, usual.num_seeds) == (0.75, 1000, 1)
+    assert (other.mean, other.evaluation_seed, other.is_standard) == (0.25, 7, False)
+    text = as_markdown("Grid World", [usual, other], SUCCESS, [])
+    assert "| sampled, best | 75.0" in text
+    assert "| sampled, best, seed 7 | 25.0" in text
+    # Training went on, and found a better one.
+    (path / "checkpoints" / "best" / "000000000006").mkdir(parents=True)
+    (group,) = groups_at(path)
+    assert result_rows(group) == []
 
 
 @pytest.mark.unit

@@ -16,7 +16,7 @@ from experiments.reports.paper import paper_set_size
 from experiments.reports.results import result_rows
 from experiments.reports.runs import policies, read_runs
 from jaxnew.representation.table import RepresentationTable, engineered_table
-from jaxnew.run import Question
+from jaxnew.results import Question
 from jaxnew.storage import config as config_lib
 from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.storage.metrics import MetricsError, MetricsLog

@@ -10,7 +10,7 @@ import pytest
 from experiments.reports.production import Cell
 from experiments.reports.studies import kind_of, paper_point
 from experiments.tasks.grid_world import TASK
-from jaxnew.run import Question
+from jaxnew.results import Question
 from jaxnew.task.places import UsageError
 from tests.experiments.handwritten import groups_at, plain_config, source_of, unwritten, write_run
 

@@ -60,7 +60,7 @@ def test_mp4_is_written_by_imageio(tmp_path: Path, monkeypatch: pytest.MonkeyPat
 
 @pytest.mark.unit
 def test_bad_videos(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with pytest.raises(ValueError, match=r"\.gif, \.mp4"):
+    with pytest.raises(ValueError, match=r"\.gif or \.mp4"):
         write_video(frames(1), tmp_path / "film.avi")
     with pytest.raises(ValueError, match="0 frames"):
         write_video([], tmp_path / "film.gif")

@@ -129,10 +129,10 @@ def test_missing_and_unknown_actions_are_refused():
         ({"vectors": np.full((6, 3), np.nan)}, "NaN or infinite numbers in 6 of 6 rows"),
         ({"vectors": np.full((6, 3), 1e300)}, "NaN or infinite"),  # Beyond float32.
         ({"ids": np.arange(5)}, "6 integers"),
-        ({"ids": np.arange(6.0)}, "6 integers"),
-        ({"ids": np.array([0, 1, 2, 3, 4, 4])}, "action 4 twice"),
-        ({"ids": np.array([-1, 1, 2, 3, 4, 5])}, "span -1..5"),
-        ({"ids": np.array([0, 1, 2, 3, 4, 2**40])}, "small number"),
+        ({"ids": np.arange(6.0)}, "list of integers, got float64"),
+        ({"ids": np.array([0, 1, 2, 3, 4, 4])}, "action 4 stands there twice"),
+        ({"ids": np.array([-1, 1, 2, 3, 4, 5])}, "action -1 is not in"),
+        ({"ids": np.array([0, 1, 2, 3, 4, 2**40])}, "action 1099511627776 is not in"),
     ],
 )
 def test_bad_contents_are_refused(changes, message):
