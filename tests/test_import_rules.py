@@ -239,7 +239,7 @@ def test_actions_needs_numpy_and_files_only() -> None:
     def others(module: str) -> set[str]:
         return {n for n in IMPORTS[module] if n.split(".")[0] not in sys.stdlib_module_names}
 
-    assert others("jaxnew.actions") == {"numpy", "jaxnew.storage.files"}
+    assert others("jaxnew.actions") == {"numpy", "numpy.typing", "jaxnew.storage.files"}
     assert others("jaxnew.storage.files") == set()
 
 
