@@ -58,7 +58,7 @@ def test_the_code_of_the_readme_is_a_script(tmp_path: Path) -> None:
         check=False,
     )
     assert done.returncode == 0, done.stdout + done.stderr
-    line = r"^ *(\w+)[-\w]* \(64 episodes, sampled\): .*is_success 0\.\d+ \[0\.\d+, 0\.\d+\]"
+    line = r"^64 sampled episodes each; .*\n +is_success .*\n(\w+)[-\w]*  0\.\d+ \[0\.\d+, 0\.\d+\]"
     assert re.findall(line, done.stdout, re.MULTILINE) == ["test", "table"]
     rows = ast.literal_eval(done.stdout.splitlines()[-1])
     assert [row["entropy_coefficient"] for row in rows] == [0.01, 0.05]

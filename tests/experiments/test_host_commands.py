@@ -48,7 +48,7 @@ def test_train_save_and_evaluate_in_a_new_process(trained: Path) -> None:
     assert any("time/rollout_s" in line for line in lines)
     results = []
     for evaluate in (run, run_alone):
-        evaluate("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7")
+        evaluate("evaluate", f"--run={trained}", "--sets=test,train", "--episodes=7", "--trust")
         results.append(evaluation(trained, "test-best-sampled-m4"))
     assert results[0]["metrics"] == results[1]["metrics"]
     assert (results[0]["num_actions"], results[0]["num_episodes"]) == (6, 7)

@@ -9,7 +9,7 @@ import sys
 
 import pytest
 
-from experiments.sweep import numbers, varied
+from experiments.sweep import ARGUMENTS, varied
 from jaxnew.representation.table import engineered_table
 from jaxnew.sweeping import checked_seeds, member_configs
 from jaxnew.task.domain import Domain, load_task
@@ -91,4 +91,4 @@ def test_bad_seeds_are_refused(seeds: list[int]) -> None:
     with pytest.raises(UsageError, match="seeds"):
         checked_seeds(seeds)
     with pytest.raises(UsageError, match="--seeds"):
-        numbers(int, ["1", "x"], "--seeds")
+        ARGUMENTS.parse(["--seeds=1,x"])

@@ -63,7 +63,9 @@ def test_a_policy_that_sees_videos_is_evaluated_in_a_new_process(runs: Path) -> 
     config = read_json(policy / "config.json")
     table = RepresentationTable.load(runs / TOY / ENCODER / "table.npz")
     assert (config["representation"], config["table_hash"]) == ("hvae-video", table.hash)
-    run_alone("evaluate", f"--run={policy}", "--sets=test", "--episodes=5")
+    flags = (f"--run={policy}", "--sets=test", "--episodes=5")
+    assert "which is not installed" in run_alone("evaluate", *flags, fails=True)
+    assert "Importing tests.video_task, which the run" in run_alone("evaluate", *flags, "--trust")
     found = evaluation(policy, "test-best-sampled-m4")
     assert found["num_episodes"] == 5
 
