@@ -47,7 +47,7 @@ CAUSES = {
 
 def count(values: Any) -> jax.Array:
     """How many of the numbers of a tree are not finite, f32[]."""
-    found = [jnp.sum(~jnp.isfinite(leaf)) for leaf in jax.tree.leaves(values)]
+    found = [jnp.sum(~jnp.isfinite(leaf), dtype=jnp.int32) for leaf in jax.tree.leaves(values)]
     return jnp.asarray(sum(found), jnp.float32)
 
 
@@ -58,7 +58,7 @@ def counts_along(values: Any) -> jax.Array:
 
 def first(counts: Mapping[str, jax.Array]) -> dict[str, jax.Array]:
     """Of counts f32[n] those f32[] of the first of the n times that has any."""
-    at = jnp.argmax(sum(counts.values(), jnp.zeros(())) > 0)
+    at = jnp.argmax(sum(counts.values(), jnp.zeros((), jnp.float32)) > 0)
     return {name: values[at] for name, values in counts.items()}
 
 

@@ -23,7 +23,7 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # nothing of what is learned.
 LAYERS = (
     {"actions", "cores", "host_checks", "storage", "observations", "collection"},
-    {"sampling", "environment", "convolution", "finiteness"},
+    {"sampling", "environment", "convolution", "finiteness", "optimizer"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation"},

@@ -13,6 +13,7 @@ from flax import struct
 
 from jaxnew import finiteness
 from jaxnew.finiteness import PREFIX
+from jaxnew.optimizer import in_32_bits
 from jaxnew.representation.batches import Batches, Choice
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
@@ -72,8 +73,10 @@ class RepresentationLearner:
         self._model = build_model(config, modality)
         self._batches = Batches.of(config, modality)
         # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
-        self._optimizer = optax.chain(
-            optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
+        self._optimizer = in_32_bits(
+            optax.chain(
+                optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
+            )
         )
         self._run = jax.jit(self._run_steps)
         self._step = jax.jit(self._step_on)
@@ -95,7 +98,7 @@ class RepresentationLearner:
         key_params, key_run = jax.random.split(key)
         key_epochs, key_steps = jax.random.split(key_run)
         num_steps = self.modality.num_steps(recordings_shape)
-        features = jnp.zeros((1, 1, num_steps, self.modality.feature_dim))
+        features = jnp.zeros((1, 1, num_steps, self.modality.feature_dim), jnp.float32)
         variables = jax.jit(self._init_variables)(key_params, features)
         return RepresentationState(
             params=variables["params"],
@@ -252,7 +255,7 @@ class RepresentationLearner:
         self, state: RepresentationState, shape: tuple[int, ...], num_steps: int
     ) -> Choice:
         """What the next `num_steps` steps see, int32[num_steps, ...]."""
-        steps = state.step + jnp.arange(num_steps)
+        steps = state.step + jnp.arange(num_steps, dtype=jnp.int32)
         return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
 
     def _step_on(
@@ -353,7 +356,7 @@ def _added(totals: Metrics, metrics: Metrics) -> Metrics:
 
 
 def _means(totals: Metrics, num_steps: int | jax.Array) -> Metrics:
+    count = jnp.asarray(num_steps, jnp.float32)
     return {
-        name: total if name.startswith(PREFIX) else total / num_steps
-        for name, total in totals.items()
+        name: total if name.startswith(PREFIX) else total / count for name, total in totals.items()
     }
