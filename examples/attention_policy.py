@@ -71,13 +71,14 @@ class AttentionMethod:
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_encoder, key_critic, key_utility = jax.random.split(key, 3)
-        some_set = jnp.zeros((2, representation_size)), jnp.ones(2, bool)
+        feature = jnp.zeros(FEATURE_SIZE, jnp.float32)
+        some_set = jnp.zeros((2, representation_size), jnp.float32), jnp.ones(2, bool)
         return {
             "encoder": self._encoder.init(key_encoder, obs)["params"],
-            "critic": self._critic.init(key_critic, obs, jnp.zeros(FEATURE_SIZE))["params"],
-            "utility": self._utility.init(
-                key_utility, jnp.zeros(FEATURE_SIZE), *some_set, method="whole"
-            )["params"],
+            "critic": self._critic.init(key_critic, obs, feature)["params"],
+            "utility": self._utility.init(key_utility, feature, *some_set, method="whole")[
+                "params"
+            ],
         }
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:

@@ -137,7 +137,7 @@ class Kicks(Environment[KicksState, KicksParams]):
 
     def reset_env(self, key: jax.Array, params: KicksParams) -> tuple[jax.Array, KicksState]:
         """Draws where puck and goal are; consumes `key`."""
-        puck, goal = jax.random.uniform(key, (2, 2), minval=-0.9, maxval=0.9)
+        puck, goal = jax.random.uniform(key, (2, 2), jnp.float32, -0.9, 0.9)
         state = KicksState(puck, goal, jnp.int32(0))
         return _observe(state), state
 
@@ -154,7 +154,8 @@ class Kicks(Environment[KicksState, KicksParams]):
         is_off_table = jnp.any(jnp.abs(positions) > 1.0)
         is_success = ~is_off_table & (distance <= params.goal_radius)
         progress = jnp.linalg.norm(state.puck - state.goal) - distance
-        reward = params.progress_reward * progress + params.goal_reward * is_success
+        arrival = jnp.where(is_success, params.goal_reward, 0.0)
+        reward = params.progress_reward * progress + arrival
         terminated = is_success | is_off_table
         info = {
             "is_success": is_success,

@@ -192,7 +192,7 @@ class Actions:
         Raises:
           ValueError: there are no such sets.
         """
-        table = jnp.asarray(table)
+        table = jnp.asarray(table, jnp.float32)
         if np.size(ids) and np.max(ids) >= len(table):
             raise ValueError(
                 f"{name} hold action {np.max(ids)}, and the table describes 0..{len(table) - 1}. "
@@ -236,7 +236,7 @@ class Actions:
         """One set per key, [..., padded_size], or the fixed set [n]; consumes `keys`."""
         if self.is_fixed:
             ids = jnp.concatenate([self.pool.always_available, self.pool.ids])
-            return AvailableSet(ids, jnp.arange(ids.shape[0]) < self.set_size)
+            return AvailableSet(ids, jnp.arange(ids.shape[0], dtype=jnp.int32) < self.set_size)
         return draw_sets(keys, self.pool, self.set_size, self.padded_size)
 
     def offered(self, available: AvailableSet) -> jax.Array:
@@ -253,7 +253,10 @@ class Actions:
         """
         if not self.first_size:
             return available
-        now = np.arange(self.padded_size) < self.first_size + self.growth * t[..., None]
+        now = (
+            np.arange(self.padded_size, dtype=np.int32)
+            < self.first_size + self.growth * t[..., None]
+        )
         return AvailableSet(available.ids, available.mask & now)
 
 
@@ -289,7 +292,8 @@ def draw_sets(
     ids = jnp.concatenate([always, drawn], axis=1)
     padding = (padded_size or set_size) - set_size
     ids = jnp.pad(ids, ((0, 0), (0, padding)), mode="edge")
-    mask = jnp.broadcast_to(jnp.arange(set_size + padding) < set_size, ids.shape)
+    is_real = jnp.arange(set_size + padding, dtype=jnp.int32) < set_size
+    mask = jnp.broadcast_to(is_real, ids.shape)
     shape = (*keys.shape, set_size + padding)
     return AvailableSet(ids.reshape(shape), mask.reshape(shape))
 
@@ -303,21 +307,24 @@ def _from_groups(keys: jax.Array, pool: ActionPool, starts: jax.Array, count: in
     num_groups = starts.shape[0] - 1
     num_drawn = _num_drawn_groups(num_groups)
     key_pairs = jax.vmap(jax.random.split)(keys)
-    noise = jax.vmap(lambda key: jax.random.uniform(key, (num_groups,)))(key_pairs[:, 0])
+    noise = jax.vmap(lambda key: jax.random.uniform(key, (num_groups,), jnp.float32))(
+        key_pairs[:, 0]
+    )
     groups = jax.lax.top_k(noise, num_drawn)[1]  # [B, H]
     sizes = (starts[1:] - starts[:-1])[groups]
-    ends = jnp.cumsum(sizes, axis=1)
+    ends = jnp.cumsum(sizes, axis=1, dtype=jnp.int32)
     # Places 0.. of the drawn groups' members put in a row, and then where they stand in the pool.
     places = _by_rejection(key_pairs[:, 1], ends[:, -1], count)
-    group = jnp.sum(places[:, :, None] >= ends[:, None, :], axis=-1)
+    group = jnp.sum(places[:, :, None] >= ends[:, None, :], axis=-1, dtype=jnp.int32)
     first = jnp.take_along_axis(starts[groups] - (ends - sizes), group, axis=1)
     return pool.ids[first + places]
 
 
 def _by_sorting_noise(key: jax.Array, pool: ActionPool, count: int) -> jax.Array:
     """int32[count] the members with the `count` largest of independent noise."""
-    noise = jax.random.uniform(key, pool.ids.shape)
-    noise = jnp.where(jnp.arange(pool.ids.shape[0]) < pool.size, noise, -1.0)
+    noise = jax.random.uniform(key, pool.ids.shape, jnp.float32)
+    is_member = jnp.arange(pool.ids.shape[0], dtype=jnp.int32) < pool.size
+    noise = jnp.where(is_member, noise, -1.0)
     return pool.ids[jax.lax.top_k(noise, count)[1]]
 
 
@@ -340,7 +347,7 @@ def _by_rejection(keys: jax.Array, bound: jax.Array, count: int) -> jax.Array:
         return jax.vmap(lambda key, bound: _random_below(key, (count,), bound))(keys, bounds).T
 
     candidates = draw(keys_first, count)
-    place = jnp.arange(count)[:, None]
+    place = jnp.arange(count, dtype=jnp.int32)[:, None]
 
     def mark_repeats(i: jax.Array, is_repeat: jax.Array) -> jax.Array:
         return is_repeat | ((candidates == candidates[i]) & (place > i))
@@ -370,7 +377,8 @@ def _by_rejection(keys: jax.Array, bound: jax.Array, count: int) -> jax.Array:
 def _first_open(chosen: jax.Array) -> jax.Array:
     """int32[B] first row of chosen [count, B] that is -1, or `count`."""
     count = chosen.shape[0]
-    return jnp.min(jnp.where(chosen < 0, jnp.arange(count)[:, None], count), axis=0)
+    place = jnp.arange(count, dtype=jnp.int32)[:, None]
+    return jnp.min(jnp.where(chosen < 0, place, count), axis=0)
 
 
 def _random_below(key: jax.Array, shape: tuple[int, ...], bound: jax.Array) -> jax.Array:

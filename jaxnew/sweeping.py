@@ -140,7 +140,7 @@ class SweepProgram:
             lambda keys: jax.lax.map(lambda key: self.trainer.learner.init(key, actions), keys)
         )
         members = jax.device_put(init(keys), self.sharding)
-        worst = jnp.full(len(self.configs), -jnp.inf)
+        worst = jnp.full(len(self.configs), -jnp.inf, jnp.float32)
         return SweepState(members, members, jax.device_put(worst, self.sharding))
 
     @cached_property
@@ -170,7 +170,7 @@ class SweepProgram:
                 def block(start: jax.Array, actions: Actions = actions) -> dict[str, jax.Array]:
                     return rollout.play(state.policy, actions, key, start)[0]
 
-                blocks = jax.lax.map(block, jnp.arange(0, episodes, rollout.width))
+                blocks = jax.lax.map(block, jnp.arange(0, episodes, rollout.width, jnp.int32))
                 results |= {
                     f"{part}/{metric}": jnp.mean(values.reshape(-1)[:episodes])
                     for metric, values in blocks.items()

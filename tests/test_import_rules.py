@@ -22,7 +22,7 @@ PACKAGES = ("jaxnew", "envs_mjx", "envs_host", "experiments", "examples")
 # `SIDEWAYS`. Files, metrics, configs and the like know nothing of what is learned.
 LAYERS = (
     {"actions", "cores", "storage", "observations", "collection"},
-    {"sampling", "environment", "convolution"},
+    {"sampling", "environment", "convolution", "optimizer"},
     {"policy", "representation"},
     {"rollout", "ppo"},
     {"loop", "evaluation"},

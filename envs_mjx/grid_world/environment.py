@@ -281,7 +281,7 @@ def _observe(state: GridWorldState) -> jax.Array:
     Compares each cell with the few numbers that make a layout: measured faster than a gather from
     a bank of the 42 layouts.
     """
-    index = np.arange(GRID_SIZE * GRID_SIZE)
+    index = np.arange(GRID_SIZE * GRID_SIZE, dtype=np.int32)
     x, y = np.divmod(index, GRID_SIZE)
     wall = is_wall().reshape(-1)
     goal = (x == LAST_CELL) & (y == LAST_CELL)
@@ -336,7 +336,8 @@ def _transition(
     is_first_visit = reaches_subgoal & ~state.has_reached_subgoal
     relative_time = num_moves.astype(jnp.float32) / max_moves.astype(jnp.float32)
     goal_reward = params.goal_reward - params.time_penalty * relative_time
-    reward = jnp.where(is_first_visit, params.subgoal_reward, 0.0) + jnp.where(
+    subgoal_reward = jnp.asarray(params.subgoal_reward, jnp.float32)
+    reward = jnp.where(is_first_visit, subgoal_reward, 0.0) + jnp.where(
         is_success, goal_reward, 0.0
     )
     reward = reward.astype(jnp.float32)

@@ -55,7 +55,8 @@ def _record_skill(
     width = PLAY_SIZE - 2 * margin
     # The goal's cell is the last in the count, so leaving it out is one cell less to draw from.
     num_starts = width * width - int(has_border)
-    cell = jax.random.randint(jax.random.fold_in(key, skill_id), (num_recordings,), 0, num_starts)
+    key = jax.random.fold_in(key, skill_id)
+    cell = jax.random.randint(key, (num_recordings,), 0, num_starts, jnp.int32)
     start_xy = margin + jnp.stack([cell // width, cell % width], axis=-1)
     return _walk(start_xy, moves, has_border).astype(jnp.uint8)
 

@@ -135,7 +135,8 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
         del params
         key_omega, key_session, key_drift = jax.random.split(key, 3)
         num_ticks, mode = _browsing_session(key_session)
-        omega = _drift(key_drift, jax.random.normal(key_omega, (VECTOR_SIZE,)), num_ticks)
+        omega = jax.random.normal(key_omega, (VECTOR_SIZE,), jnp.float32)
+        omega = _drift(key_drift, omega, num_ticks)
         state = RecommenderState(omega, mode, jnp.int32(0), jnp.int32(0))
         return _observe(state), state
 
@@ -171,12 +172,13 @@ class Recommender(Environment[RecommenderState, RecommenderParams]):
             omega=_drift(key_drift, state.omega, num_ticks),
             mode=jnp.where(is_browsing, session_mode, mode),
             num_recommendations=state.num_recommendations + 1,
-            num_clicks=state.num_clicks + is_clicked,
+            num_clicks=state.num_clicks + is_clicked.astype(jnp.int32),
         )
         terminated = next_state.mode == STOP
         truncated = ~terminated & (next_state.num_recommendations >= params.max_recommendations)
         info: Info = {
-            "click_through_rate": next_state.num_clicks / next_state.num_recommendations,
+            "click_through_rate": next_state.num_clicks.astype(jnp.float32)
+            / next_state.num_recommendations.astype(jnp.float32),
             "num_clicks": next_state.num_clicks,
             "episode_length": next_state.num_recommendations,
             "invalid_action": ~is_valid,
@@ -199,7 +201,8 @@ def click_probability(logit: jax.Array) -> jax.Array:
 def _next_mode(key: jax.Array, mode: jax.Array) -> jax.Array:
     """int32[] the mode after a tick; consumes `key`."""
     cumulative = jnp.asarray(np.cumsum(TRANSITIONS, axis=1)[:, :-1], jnp.float32)[mode]
-    return jnp.sum(jax.random.uniform(key) >= cumulative).astype(jnp.int32)
+    is_past = jax.random.uniform(key, (), jnp.float32) >= cumulative
+    return jnp.sum(is_past, dtype=jnp.int32)
 
 
 def _browsing_session(key: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -210,9 +213,9 @@ def _browsing_session(key: jax.Array) -> tuple[jax.Array, jax.Array]:
     """
     key_ticks, key_exit = jax.random.split(key)
     stays, to_bandit, to_stop = TRANSITIONS[ORGANIC]
-    num_ticks = jax.random.geometric(key_ticks, 1.0 - stays, dtype=jnp.int32)
-    is_over = jax.random.bernoulli(key_exit, to_stop / (to_bandit + to_stop))
-    return num_ticks, jnp.where(is_over, STOP, BANDIT).astype(jnp.int32)
+    num_ticks = jax.random.geometric(key_ticks, np.float32(1.0 - stays), dtype=jnp.int32)
+    is_over = jax.random.bernoulli(key_exit, np.float32(to_stop / (to_bandit + to_stop)))
+    return num_ticks, jnp.where(is_over, jnp.int32(STOP), BANDIT)
 
 
 def _drift(key: jax.Array, omega: jax.Array, num_ticks: jax.Array) -> jax.Array:
@@ -223,8 +226,9 @@ def _drift(key: jax.Array, omega: jax.Array, num_ticks: jax.Array) -> jax.Array:
     freedom: the same distribution without a loop.
     """
     key_scale, key_direction = jax.random.split(key)
-    squares = jax.random.chisquare(key_scale, num_ticks.astype(jnp.float32))
-    return omega + _DRIFT * jnp.sqrt(squares) * jax.random.normal(key_direction, omega.shape)
+    squares = jax.random.chisquare(key_scale, num_ticks.astype(jnp.float32), dtype=jnp.float32)
+    direction = jax.random.normal(key_direction, omega.shape, jnp.float32)
+    return omega + _DRIFT * jnp.sqrt(squares) * direction
 
 
 def _observe(state: RecommenderState) -> jax.Array:

@@ -67,10 +67,10 @@ def task_camera(position_dim: int = 1) -> Camera:
         raise ValueError(f"position_dim={position_dim} is not a variant; it is 0, 1 or 2.")
     position, turn = ((0.0, 7.0, 2.0), -1.57) if position_dim < 2 else ((0.0, 4.0, 5.0), -0.8)
     return Camera(
-        position=jnp.array(position),
-        right=jnp.array((1.0, 0.0, 0.0)),
-        down=jnp.array((0.0, math.cos(turn), math.sin(turn))),
-        forward=jnp.array((0.0, math.sin(turn), -math.cos(turn))),
+        position=jnp.array(position, jnp.float32),
+        right=jnp.array((1.0, 0.0, 0.0), jnp.float32),
+        down=jnp.array((0.0, math.cos(turn), math.sin(turn)), jnp.float32),
+        forward=jnp.array((0.0, math.sin(turn), -math.cos(turn)), jnp.float32),
     )
 
 
@@ -184,7 +184,7 @@ def _light(
 ) -> jax.Array:
     """f32[P] how bright surfaces are, relative to their colour."""
     normal = normals(bodies, hits, points)
-    light = _AMBIENT + jnp.where(hits.surface < 0, 0.0, _EMISSION)
+    light = _AMBIENT + jnp.where(hits.surface < 0, jnp.float32(0.0), _EMISSION)
     light += _HEADLIGHT * jnp.maximum(-dot(normal, camera.forward), 0.0)
     for spot in _SPOT_POSITIONS:
         towards, distance = _towards(spot, points)
@@ -221,7 +221,7 @@ def _directions(camera: Camera, size: int) -> Vector:
 
 def _table_distance(origin: Vector, directions: Vector, has_table: bool) -> jax.Array:
     """f32[P] to the table's top, seen from above; inf where it is not met."""
-    nowhere = jnp.full(directions[0].shape, jnp.inf)
+    nowhere = jnp.full(directions[0].shape, jnp.inf, jnp.float32)
     if not has_table:
         return nowhere
     is_down = directions[2] < 0.0

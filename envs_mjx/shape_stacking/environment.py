@@ -179,7 +179,8 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
         """Two cylinders at rest; consumes `key`. Returns (obs uint8[84, 84, 4], state)."""
         del params
         key_cylinder, key_center, key_gap = jax.random.split(key, 3)
-        cylinder = jax.random.choice(key_cylinder, jnp.array(rules.START_CYLINDERS, jnp.int32))
+        number = jax.random.randint(key_cylinder, (), 0, len(rules.START_CYLINDERS), jnp.int32)
+        cylinder = jnp.array(rules.START_CYLINDERS, jnp.int32)[number]
         low, high = rules.START_CENTER
         center = jax.random.uniform(key_center, (), jnp.float32, low, high)
         low, high = rules.START_GAP
@@ -226,7 +227,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
                 [state.frames[:, :, 1:], self.picture(bodies)[:, :, None]], axis=-1
             ),
             num_actions=state.num_actions + 1,
-            num_repeats=state.num_repeats + is_repeat,
+            num_repeats=state.num_repeats + is_repeat.astype(jnp.int32),
             max_height=jnp.maximum(state.max_height, height),
         )
         terminated = stop | ~ok
@@ -237,7 +238,9 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
             "final_height": height,
             "max_height": next_state.max_height,
             "episode_length": next_state.num_actions,
-            "num_placed": jnp.sum(bodies.shape_ids[scene.NUM_START_CYLINDERS :] >= 0),
+            "num_placed": jnp.sum(
+                bodies.shape_ids[scene.NUM_START_CYLINDERS :] >= 0, dtype=jnp.int32
+            ),
             "num_repeats": next_state.num_repeats,
             "is_stopped": stop,
             "has_failed": ~ok,
@@ -268,7 +271,7 @@ class ShapeStacking(Environment[StackingState, StackingParams]):
                 f"position_dim={self.position_dim} takes f32[{self.position_dim}]."
             )
         position = jnp.clip(jnp.asarray(action.position, jnp.float32), -1.0, 1.0)
-        return jnp.zeros(2).at[: self.position_dim].set(position)
+        return jnp.zeros(2, jnp.float32).at[: self.position_dim].set(position)
 
     def picture(self, bodies: Bodies, num_bodies: int = scene.NUM_SLOTS) -> jax.Array:
         """The picture uint8[84, 84] that an observation shows, of the first bodies only."""

@@ -115,7 +115,7 @@ def _picture(shape_id: jax.Array, view: jax.Array, shapes: tuple[Shape, ...]) ->
     # A shape alone has nothing to cast shadows on, but for the sides of an arch's opening.
     return render_rgb(
         shape_id[None],
-        jnp.zeros((1, 3)),
+        jnp.zeros((1, 3), jnp.float32),
         quaternion[None],
         camera,
         has_table=False,

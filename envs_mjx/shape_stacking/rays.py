@@ -217,7 +217,7 @@ def _cross_planes(
     planes: jax.Array, start: Vector, along: Vector
 ) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The part of each line inside all planes, and the number of the one where it begins."""
-    first = jnp.full(along[0].shape, -jnp.inf)
+    first = jnp.full(along[0].shape, -jnp.inf, jnp.float32)
     last, surface = -first, jnp.zeros(first.shape, jnp.int32)
     for number, plane in enumerate(planes):
         speed = dot(plane, along)
@@ -225,7 +225,7 @@ def _cross_planes(
         is_parallel = jnp.abs(speed) < _PARALLEL
         at = room / jnp.where(is_parallel, 1.0, speed)
         # A parallel line is inside everywhere or nowhere.
-        never = jnp.where(room < 0.0, jnp.inf, -jnp.inf)
+        never = jnp.where(room < 0.0, jnp.float32(jnp.inf), -jnp.inf)
         entry = jnp.where(is_parallel, never, jnp.where(speed < 0.0, at, -jnp.inf))
         surface = jnp.where(entry > first, number, surface)
         first = jnp.maximum(first, entry)
@@ -251,7 +251,8 @@ def _cross_quadric(quadric: jax.Array, start: Vector, along: Vector) -> Interval
     c += quadric[0] * point[0] ** 2 + quadric[1] * point[1] ** 2 + quadric[2] * point[2] ** 2
     discriminant = b**2 - a * c
     # The larger root first, the other from their product: no cancellation, also for small `a`.
-    larger = -(b + jnp.where(b < 0.0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(discriminant, 0.0)))
+    sign = jnp.where(b < 0.0, jnp.float32(-1.0), 1.0)
+    larger = -(b + sign * jnp.sqrt(jnp.maximum(discriminant, 0.0)))
     root, other = larger / a, c / jnp.where(larger == 0.0, 1.0, larger)
     low, high = jnp.minimum(root, other), jnp.maximum(root, other)
 

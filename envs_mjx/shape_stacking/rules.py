@@ -88,7 +88,7 @@ def start(
     x = jnp.asarray(center, jnp.float32) + jnp.stack([-half, half])
     z = scene.TABLE_HEIGHT + jnp.asarray(shape_table(()).s)[cylinder_id]
     qpos = jnp.asarray(scene.parked_qpos())
-    qpos = qpos.at[:2, :3].set(jnp.stack([x, jnp.zeros(2), jnp.full(2, z)], axis=-1))
+    qpos = qpos.at[:2, :3].set(jnp.stack([x, jnp.zeros_like(x), jnp.full(2, z)], axis=-1))
     shape_ids = jnp.full(scene.NUM_SLOTS, _UNUSED, jnp.int32).at[:2].set(cylinder_id)
     return Bodies(shape_ids, qpos, jnp.zeros((scene.NUM_SLOTS, 6), jnp.float32))
 
@@ -165,7 +165,7 @@ def tower_reward(bodies: Bodies, variant: str = "release") -> jax.Array:
     else:
         counted, values = bodies.is_used, z - scene.TABLE_HEIGHT
     total = jnp.sum(values, where=counted)
-    mean = total / jnp.maximum(jnp.sum(counted), 1)
+    mean = total / jnp.maximum(jnp.sum(counted, dtype=jnp.float32), 1.0)
     return 0.5 * tower_height(bodies) + 0.5 * mean
 
 

@@ -155,8 +155,8 @@ class _ConditionedHead(nn.Module):
 
     def setup(self) -> None:
         init = nn.initializers.orthogonal(_POSITION_GAIN)
-        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE))
-        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,))
+        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE), jnp.float32)
+        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,), jnp.float32)
         self.out = orthogonal_dense(self.position_dim, _POSITION_GAIN)
 
     def project(self, embedded: jax.Array) -> jax.Array:
@@ -205,7 +205,7 @@ class AuxiliaryMethod(FeatureMethod):
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_base, key_heads, key_alpha, key_beta = jax.random.split(key, 4)
-        feature = jnp.zeros(FEATURE_SIZE)
+        feature = jnp.zeros(FEATURE_SIZE, jnp.float32)
         auxiliary = {"heads": self._heads.init(key_heads, feature).get("params", {})}
         if self._is_conditioned:
             for name, key_head in (("alpha", key_alpha), ("beta", key_beta)):

@@ -37,7 +37,8 @@ class DiagonalGaussian:
 
     def sample(self, key: jax.Array) -> jax.Array:
         """f32[..., d]; consumes `key`."""
-        return self.mean + jnp.sqrt(self.variance) * jax.random.normal(key, self.mean.shape)
+        noise = jax.random.normal(key, self.mean.shape, jnp.float32)
+        return self.mean + jnp.sqrt(self.variance) * noise
 
     def log_prob(self, sample: jax.Array) -> jax.Array:
         """f32[...] joint log-density of a sample f32[..., d]."""

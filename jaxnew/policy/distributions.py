@@ -36,11 +36,11 @@ class Categorical:
         """
         probabilities = jax.nn.softmax(self.logits)
         cumulative = jnp.cumsum(probabilities, axis=-1)
-        uniform = jax.random.uniform(key, (*self.logits.shape[:-1], 1))
+        uniform = jax.random.uniform(key, (*self.logits.shape[:-1], 1), jnp.float32)
         # Sums round, so an entry of probability zero could be reached first. One is always reached:
         # the uniform number is at most 1 - 2**-23, and the product with it rounds below the sum.
         is_reached = (cumulative > uniform * cumulative[..., -1:]) & (probabilities > 0.0)
-        return jnp.argmax(is_reached, axis=-1).astype(jnp.int32)
+        return jax.lax.argmax(is_reached, is_reached.ndim - 1, jnp.int32)
 
     def log_prob(self, choice: jax.Array) -> jax.Array:
         """f32[...] log-probability of int32[...] choices."""
@@ -55,7 +55,7 @@ class Categorical:
 
     def mode(self) -> jax.Array:
         """int32[...] most likely choice, the first of equals."""
-        return jnp.argmax(self.logits, axis=-1).astype(jnp.int32)
+        return jax.lax.argmax(self.logits, self.logits.ndim - 1, jnp.int32)
 
 
 _INSIDE = 1e-6  # Distance of a sample from 0 and 1: float32 draws of exactly 1 happen.
@@ -74,7 +74,8 @@ class Beta:
 
     def sample(self, key: jax.Array) -> jax.Array:
         """f32[..., k] in [1e-6, 1 - 1e-6]; consumes `key`."""
-        return jnp.clip(jax.random.beta(key, self.alpha, self.beta), _INSIDE, 1.0 - _INSIDE)
+        drawn = jax.random.beta(key, self.alpha, self.beta, dtype=jnp.float32)
+        return jnp.clip(drawn, _INSIDE, 1.0 - _INSIDE)
 
     def log_prob(self, sample: jax.Array) -> jax.Array:
         """f32[...] joint log-density of a sample f32[..., k] inside (0, 1)."""
@@ -109,4 +110,5 @@ def nearest_id(points: jax.Array, available: AvailableSet, table: jax.Array) -> 
     """
     differences = table[available.ids] - points[..., None, :]
     distances = jnp.sum(differences**2, axis=-1)
-    return available.id_of(jnp.argmin(jnp.where(available.mask, distances, jnp.inf), axis=-1))
+    distances = jnp.where(available.mask, distances, jnp.inf)
+    return available.id_of(jax.lax.argmin(distances, distances.ndim - 1, jnp.int32))

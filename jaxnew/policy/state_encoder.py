@@ -142,7 +142,7 @@ class FeatureMethod:
 
     def init_critic(self, key: jax.Array, obs: jax.Array) -> Any:
         """Fresh parameters of the critic; consumes `key`."""
-        return self._critic.init(key, obs, jnp.zeros(FEATURE_SIZE))["params"]
+        return self._critic.init(key, obs, jnp.zeros(FEATURE_SIZE, jnp.float32))["params"]
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[..., 64] the state feature."""

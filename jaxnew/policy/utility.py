@@ -34,8 +34,8 @@ class Utility(nn.Module):
     def setup(self) -> None:
         init = nn.initializers.orthogonal(_UTILITY_GAIN)
         self.embed = nn.Dense(FEATURE_SIZE, kernel_init=init)
-        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE))
-        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,))
+        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE), jnp.float32)
+        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,), jnp.float32)
         self.score = nn.Dense(1, kernel_init=init)
 
     def embedded(self, representations: jax.Array) -> jax.Array:
@@ -79,8 +79,8 @@ class UtilityMethod(FeatureMethod):
             "critic": self.init_critic(key_critic, obs),
             "utility": self._utility.init(
                 key_utility,
-                jnp.zeros(FEATURE_SIZE),
-                jnp.zeros((1, representation_size)),
+                jnp.zeros(FEATURE_SIZE, jnp.float32),
+                jnp.zeros((1, representation_size), jnp.float32),
                 method="concatenated",
             )["params"],
         }
@@ -131,5 +131,5 @@ class RandomMethod(UtilityMethod):
     ) -> Categorical:
         """The uniform distribution over the real entries."""
         del params, projected
-        logits = jnp.zeros((*features.shape[:-1], mask.shape[-1]))
+        logits = jnp.zeros((*features.shape[:-1], mask.shape[-1]), jnp.float32)
         return Categorical.masked(logits, mask)

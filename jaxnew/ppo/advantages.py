@@ -33,7 +33,8 @@ def gae(
       advantages f32[T, N] and value targets f32[T, N] (advantages + values).
     """
     chex.assert_equal_shape([rewards, values, next_values, terminated, done])
-    deltas = rewards + discount * next_values * ~terminated - values
+    goes_on = jnp.asarray(~terminated, jnp.float32)
+    deltas = rewards + discount * next_values * goes_on - values
 
     def step(
         advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import optax
 from flax import struct
 
+from jaxnew.optimizer import in_32_bits
 from jaxnew.policy import PolicyMethod
 from jaxnew.ppo.advantages import gae
 from jaxnew.ppo.config import PPOConfig
@@ -64,9 +65,11 @@ class GradientSteps:
     @property
     def optimizer(self) -> optax.GradientTransformation:
         """Gradient clipping and Adam without its learning rate, which is traced."""
-        return optax.chain(
-            optax.clip_by_global_norm(self.config.max_grad_norm),
-            optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-5),
+        return in_32_bits(
+            optax.chain(
+                optax.clip_by_global_norm(self.config.max_grad_norm),
+                optax.scale_by_adam(b1=0.9, b2=0.999, eps=1e-5),
+            )
         )
 
     def learn(
@@ -119,7 +122,7 @@ class GradientSteps:
         indices = self._minibatch_indices(key)
         (params, opt_state), metrics = jax.lax.scan(gradient_step, (params, opt_state), indices)
         nonfinite = {
-            f"nonfinite/{name}": jnp.sum(~jnp.isfinite(values)).astype(jnp.float32)
+            f"nonfinite/{name}": jnp.sum(~jnp.isfinite(values), dtype=jnp.int32).astype(jnp.float32)
             for name, values in {
                 "loss": metrics["loss/total"],
                 "gradient": metrics["gradient_norm"],
@@ -136,12 +139,13 @@ class GradientSteps:
 
     def _learning_rate_factor(self, step: jax.Array) -> jax.Array:
         """Linear from 1 to 0.1 over `lr_updates`, then constant."""
-        return 1.0 - 0.9 * jnp.minimum(1.0, step / self.config.lr_updates)
+        return 1.0 - 0.9 * jnp.minimum(1.0, step.astype(jnp.float32) / self.config.lr_updates)
 
     def _minibatch_indices(self, key: jax.Array) -> jax.Array:
         """int32[epochs * minibatches, B]: a fresh permutation of all transitions per epoch."""
         keys = jax.random.split(key, self.config.num_epochs)
-        orders = [jax.random.permutation(k, self.config.steps_per_update) for k in keys]
+        transitions = jnp.arange(self.config.steps_per_update, dtype=jnp.int32)
+        orders = [jax.random.permutation(key, transitions) for key in keys]
         return jnp.stack(orders).reshape(-1, self.config.minibatch_size)
 
     def _gradient(

@@ -63,6 +63,7 @@ class Learner(GradientSteps):
           `Rollout.collect`.
         """
         start = time.perf_counter()
+        hyperparameters = jax.tree.map(jnp.float32, hyperparameters)
         key_rollout, key_learn = jax.random.split(jax.random.fold_in(state.key, state.step))
         rollout, batch, sums = self.rollout.collect(
             key_rollout, state.rollout, state.params, actions, hyperparameters.discount

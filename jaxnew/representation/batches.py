@@ -49,10 +49,11 @@ def hvae_choice(
     """
     num_actions, num_recordings = shape[:2]
     epoch, batch = jnp.divmod(step, num_actions // actions_per_batch)
-    order = jax.random.permutation(jax.random.fold_in(key_epochs, epoch), num_actions)
+    all_actions = jnp.arange(num_actions, dtype=jnp.int32)
+    order = jax.random.permutation(jax.random.fold_in(key_epochs, epoch), all_actions)
     actions = jax.lax.dynamic_slice_in_dim(order, batch * actions_per_batch, actions_per_batch)
     # The S largest of independent draws are a uniform subset.
-    noise = jax.random.uniform(key_step, (actions_per_batch, num_recordings))
+    noise = jax.random.uniform(key_step, (actions_per_batch, num_recordings), jnp.float32)
     _, chosen = jax.lax.top_k(noise, recordings_per_action)
     return Choice(actions[:, None], chosen)
 
@@ -65,7 +66,7 @@ def flat_vae_choice(key_step: jax.Array, shape: tuple[int, ...], num_recordings:
       shape: (A, S_total, ...) of the recordings.
       num_recordings: n.
     """
-    chosen = jax.random.randint(key_step, (1, num_recordings), 0, shape[0] * shape[1])
+    chosen = jax.random.randint(key_step, (1, num_recordings), 0, shape[0] * shape[1], jnp.int32)
     return Choice(*jnp.divmod(chosen, shape[1]))
 
 

@@ -20,10 +20,12 @@ from flax import linen as nn
 Initializer = Callable[..., jax.Array]
 
 # Xavier-normal with gain sqrt(2), that is std = 2 / sqrt(fan_in + fan_out).
-xavier_normal: Initializer = nn.initializers.variance_scaling(2.0, "fan_avg", "normal")
+xavier_normal: Initializer = nn.initializers.variance_scaling(
+    2.0, "fan_avg", "normal", dtype=jnp.float32
+)
 
 # Free log-variance vectors start from N(0, 1).
-free_log_variance: Initializer = nn.initializers.normal(1.0)
+free_log_variance: Initializer = nn.initializers.normal(1.0, jnp.float32)
 
 
 def uniform_within(bound: float) -> Initializer:
@@ -56,7 +58,7 @@ class Dense(nn.Module):
         if self.pytorch_init:
             kernel_init = bias_init = uniform_within(1.0 / math.sqrt(num_inputs))
         kernel = self.param("kernel", kernel_init, (num_inputs, self.features))
-        bias = self.param("bias", bias_init, (self.features,))
+        bias = self.param("bias", bias_init, (self.features,), jnp.float32)
         y = kernel.T @ x.reshape(num_inputs, -1) + bias[:, None]
         return y.reshape(self.features, *x.shape[1:])
 

@@ -11,6 +11,7 @@ import numpy as np
 import optax
 from flax import struct
 
+from jaxnew.optimizer import in_32_bits
 from jaxnew.representation.batches import Batches, Choice
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.modality import Modality
@@ -70,8 +71,10 @@ class RepresentationLearner:
         self._model = build_model(config, modality)
         self._batches = Batches.of(config, modality)
         # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
-        self._optimizer = optax.chain(
-            optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
+        self._optimizer = in_32_bits(
+            optax.chain(
+                optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
+            )
         )
         self._run = jax.jit(self._run_steps)
         self._step = jax.jit(self._step_on)
@@ -93,7 +96,7 @@ class RepresentationLearner:
         key_params, key_run = jax.random.split(key)
         key_epochs, key_steps = jax.random.split(key_run)
         num_steps = self.modality.num_steps(recordings_shape)
-        features = jnp.zeros((1, 1, num_steps, self.modality.feature_dim))
+        features = jnp.zeros((1, 1, num_steps, self.modality.feature_dim), jnp.float32)
         variables = jax.jit(self._init_variables)(key_params, features)
         return RepresentationState(
             params=variables["params"],
@@ -220,7 +223,8 @@ class RepresentationLearner:
         shapes = jax.eval_shape(self._update, state, recordings)[1]
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         state, totals = jax.lax.fori_loop(0, num_steps, body, (state, zeros))
-        means = {name: total / num_steps for name, total in totals.items()}
+        count = num_steps.astype(jnp.float32)
+        means = {name: total / count for name, total in totals.items()}
         return state, {**means, "nonfinite": totals["nonfinite"]}
 
     def _update(
@@ -252,7 +256,7 @@ class RepresentationLearner:
         self, state: RepresentationState, shape: tuple[int, ...], num_steps: int
     ) -> Choice:
         """What the next `num_steps` steps see, int32[num_steps, ...]."""
-        steps = state.step + jnp.arange(num_steps)
+        steps = state.step + jnp.arange(num_steps, dtype=jnp.int32)
         return jax.lax.map(lambda step: self._choice(replace(state, step=step), shape), steps)
 
     def _step_on(
@@ -266,7 +270,9 @@ class RepresentationLearner:
             state.params, state.batch_stats, features, key_noise, weight
         )
         updates, opt_state = self._optimizer.update(grads, state.opt_state, state.params)
-        nonfinite = sum(jnp.sum(~jnp.isfinite(leaf)) for leaf in jax.tree.leaves((loss, grads)))
+        nonfinite = sum(
+            jnp.sum(~jnp.isfinite(leaf), dtype=jnp.int32) for leaf in jax.tree.leaves((loss, grads))
+        )
         metrics = {
             "loss": loss,
             "reconstruction": terms.reconstruction,

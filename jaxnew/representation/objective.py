@@ -131,8 +131,10 @@ def draw_noise(
     """Noise for `batch_shape` = (B, S) recordings; consumes `key`."""
     key_action, key_observation = jax.random.split(key)
     return LatentNoise(
-        action=jax.random.normal(key_action, (batch_shape[0], action_latent)),
-        observation=jax.random.normal(key_observation, (*batch_shape, observation_latent)),
+        action=jax.random.normal(key_action, (batch_shape[0], action_latent), jnp.float32),
+        observation=jax.random.normal(
+            key_observation, (*batch_shape, observation_latent), jnp.float32
+        ),
     )
 
 
@@ -172,7 +174,7 @@ def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> E
         output.prior_mean,
         output.prior_log_variance,
     )
-    kl_action = jnp.zeros(())
+    kl_action = jnp.zeros((), jnp.float32)
     if output.action_mean is not None and output.action_log_variance is not None:
         kl_action = jnp.sum(gaussian_kl(output.action_mean, output.action_log_variance))
     num_recordings = features.shape[0] * features.shape[1]

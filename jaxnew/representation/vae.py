@@ -94,7 +94,7 @@ class FlatVAE(nn.Module):
             action_log_variance=None,
             observation_mean=jnp.moveaxis(mean, 0, -1),
             observation_log_variance=log_variance,
-            prior_mean=jnp.zeros((features.shape[0], 1, self.observation_latent)),
+            prior_mean=jnp.zeros((features.shape[0], 1, self.observation_latent), jnp.float32),
             prior_log_variance=jnp.zeros_like(log_variance),
             prediction=prediction,
             likelihood_log_variance=self.likelihood_log_variance,

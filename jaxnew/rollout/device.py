@@ -68,11 +68,12 @@ class _Stock:
 
     def deal(self, done: jax.Array, available: AvailableSet) -> tuple[_Stock, AvailableSet]:
         """Sets [N, m] for the next step: the next ones of the stock where `done` bool[N]."""
-        place = self.num_dealt + jnp.cumsum(done) - done
+        ends = done.astype(jnp.int32)
+        place = self.num_dealt + jnp.cumsum(ends, dtype=jnp.int32) - ends
         dealt = jax.tree.map(
             lambda stocked, old: jnp.where(done[:, None], stocked[place], old), self.sets, available
         )
-        return replace(self, num_dealt=self.num_dealt + jnp.sum(done)), dealt
+        return replace(self, num_dealt=self.num_dealt + jnp.sum(ends, dtype=jnp.int32)), dealt
 
 
 @dataclass(frozen=True)
@@ -125,7 +126,7 @@ class DeviceRollout:
             available=actions.draw(jax.random.split(key_sets, self.config.num_envs)),
             observation_statistics=statistics,
             return_statistics=RunningStatistics.zeros(()),
-            discounted_return=jnp.zeros(self.config.num_envs),
+            discounted_return=jnp.zeros(self.config.num_envs, jnp.float32),
         )
 
     def collect(
@@ -163,7 +164,7 @@ class DeviceRollout:
         if actions.is_fixed:
             batch = replace(batch, available=state.available)
         sums = {
-            name: jnp.sum(jnp.where(batch.done, info[name], 0.0))
+            name: jnp.sum(jnp.where(batch.done, jnp.asarray(info[name], jnp.float32), 0.0))
             for name in self.env.episode_metrics
         }
         return state, batch, {"num_episodes": jnp.sum(batch.done.astype(jnp.float32)), **sums}
@@ -322,7 +323,7 @@ class DeviceRollout:
           first states [width, ...] and, of each of the T steps of the longest episode, the states
           after it, actions and rewards [T, width, ...].
         """
-        episodes = start + jnp.arange(self.width)
+        episodes = start + jnp.arange(self.width, dtype=jnp.int32)
         keys = jax.vmap(lambda i: jax.random.split(jax.random.fold_in(key, i), 3))(episodes)
         keys_sets, keys_reset, keys_steps = keys[:, 0], keys[:, 1], keys[:, 2]
         available = actions.draw(keys_sets)
@@ -355,9 +356,10 @@ class DeviceRollout:
             return (obs, state, is_over | terminated | truncated, metrics), kept
 
         names = (*self.env.episode_metrics, "num_steps")
-        zeros = {name: jnp.zeros(self.width) for name in names}
+        zeros = {name: jnp.zeros(self.width, jnp.float32) for name in names}
         carry = (obs, first_state, jnp.zeros(self.width, bool), zeros)
-        carry, kept = jax.lax.scan(step, carry, jnp.arange(self.max_episode_steps))
+        times = jnp.arange(self.max_episode_steps, dtype=jnp.int32)
+        carry, kept = jax.lax.scan(step, carry, times)
         return carry[3], (available, first_state, *kept) if keeps_all else None
 
     @cached_property

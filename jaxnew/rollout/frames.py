@@ -34,7 +34,7 @@ class FrameHistory:
     def take(self, indices: jax.Array) -> jax.Array:
         """The stacks [B, H, W, k] of transitions int32[B], which count `t * N + n`."""
         num_envs = self.age.shape[1]
-        newest_last = jnp.arange(self.stack_size)
+        newest_last = jnp.arange(self.stack_size, dtype=jnp.int32)
         rows = indices[:, None] + num_envs * newest_last
         frames = jnp.asarray(self.frames).reshape(-1, *self.frames.shape[2:])[rows]
         is_there = (

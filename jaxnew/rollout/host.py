@@ -153,7 +153,7 @@ class HostRollout:
             environments=self.environments.leave(),
             frames=frames,
             age=np.zeros(num_envs, np.int32),
-            available=actions.draw(fold_in_each(key, jnp.arange(num_envs))),
+            available=actions.draw(fold_in_each(key, jnp.arange(num_envs, dtype=jnp.int32))),
         )
 
     def collect(
@@ -225,8 +225,8 @@ class HostRollout:
 
         @jax.jit
         def draw(key: jax.Array, actions: Actions) -> AvailableSet:
-            steps = fold_in_each(key, jnp.arange(self.config.num_steps))
-            envs = jnp.arange(self.config.num_envs)
+            steps = fold_in_each(key, jnp.arange(self.config.num_steps, dtype=jnp.int32))
+            envs = jnp.arange(self.config.num_envs, dtype=jnp.int32)
             return actions.draw(jax.vmap(lambda key: fold_in_each(key, envs))(steps))
 
         return draw

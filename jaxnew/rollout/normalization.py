@@ -28,7 +28,9 @@ class RunningStatistics:
     @classmethod
     def zeros(cls, shape: tuple[int, ...]) -> RunningStatistics:
         """Mean 0 and variance 1 that the first batch all but replaces."""
-        return cls(jnp.zeros(shape), jnp.ones(shape), jnp.float32(_INITIAL_COUNT))
+        return cls(
+            jnp.zeros(shape, jnp.float32), jnp.ones(shape, jnp.float32), jnp.float32(_INITIAL_COUNT)
+        )
 
     def update(self, batch: jax.Array) -> RunningStatistics:
         """Statistics after one more batch f32[N, ...].

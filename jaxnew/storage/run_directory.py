@@ -347,9 +347,9 @@ def _versions() -> dict[str, str]:
 
 
 def describe_session() -> dict[str, Any]:
-    """What runs now: start time, command line, revision, versions, devices, float precision.
+    """What runs now: start time, command line, revision, versions, devices, and JAX's settings.
 
-    Devices and precision are those of jax and are None in a process that has not imported it.
+    Devices, precision and random numbers are JAX's and None in a process without it.
     """
     jax = sys.modules.get("jax")
     return {
@@ -364,5 +364,11 @@ def describe_session() -> dict[str, Any]:
         else {
             "matmul": str(jax.config.jax_default_matmul_precision or "default"),
             "x64": bool(jax.config.jax_enable_x64),
+        },
+        "random": None
+        if jax is None
+        else {
+            "implementation": str(jax.config.jax_default_prng_impl),
+            "is_partitionable": bool(jax.config.jax_threefry_partitionable),
         },
     }

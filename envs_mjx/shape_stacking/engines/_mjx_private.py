@@ -12,7 +12,7 @@ import importlib
 import importlib.metadata
 import inspect
 import io
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import lru_cache
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -27,7 +27,7 @@ from envs_mjx.shape_stacking import scene
 with contextlib.redirect_stdout(io.StringIO()):
     from mujoco import mjx
 
-__all__ = ["Contacts", "check_version", "is_as_expected", "mjx", "private", "step"]
+__all__ = ["Contacts", "check_version", "in_32_bits", "is_as_expected", "mjx", "private", "step"]
 
 WRITTEN_FOR = "3.17"
 
@@ -113,6 +113,13 @@ def private() -> SimpleNamespace:
         value = getattr(importlib.import_module(f"{_SOURCE}.{module}"), attribute)
         found[attribute.lstrip("_")] = value
     return SimpleNamespace(**found)
+
+
+@contextlib.contextmanager
+def in_32_bits() -> Iterator[None]:
+    """Inside, MJX makes arrays of f32 and int32, whatever JAX is set to."""
+    with jax.enable_x64(False), jax.numpy_dtype_promotion("standard"):
+        yield
 
 
 def step(model: Any, data: Any, find_contacts: Callable[[Any], Contacts]) -> Any:

@@ -81,8 +81,9 @@ class Mjx:
         self.shapes = shapes
         self._limits = limits or Limits()
         model = mujoco.MjModel.from_xml_string(_scene_text(num_slots, solver, max_contacts))
-        self._model = _mjx_private.mjx.put_model(model, impl="jax")
-        self._data = _mjx_private.mjx.make_data(model, impl="jax")
+        with _mjx_private.in_32_bits():
+            self._model = _mjx_private.mjx.put_model(model, impl="jax")
+            self._data = _mjx_private.mjx.make_data(model, impl="jax")
         self._jitted = jax.jit(self._settle_flat)
 
     def __copy__(self) -> Mjx:
@@ -107,7 +108,7 @@ class Mjx:
 
     def _settle_flat(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:
         # Accelerators would multiply matrices in less than f32.
-        with jax.default_matmul_precision("highest"):
+        with _mjx_private.in_32_bits(), jax.default_matmul_precision("highest"):
             return jax.vmap(self._settle_one)(shape_ids, qpos, qvel)
 
     def _settle_one(self, shape_ids: jax.Array, qpos: jax.Array, qvel: jax.Array) -> Settled:

@@ -53,6 +53,7 @@ def test_a_new_run_explains_itself(tmp_path: Path) -> None:
     assert session["versions"]["python"].startswith("3.")
     assert {"jax", "jaxlib", "flax", "optax", "numpy"} <= set(session["versions"])
     assert session["command"][0]
+    assert "random" in session
     assert session["started"] > "2020"
     assert not run.is_writable
     # Nothing else was left beside it.
