@@ -35,13 +35,12 @@ from jaxnew.representation.objective import draw_noise
 from jaxnew.representation.table import engineered_table
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.sampling import Actions
-from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.settings import with_set
 from jaxnew.trainer import Trainer
 from jaxnew.training import train_config
-from tests.experiments.commands import OPTIMIZED, run_alone
-from tests.experiments.create_runs import saved
+from tests.experiments.commands import ENVIRONMENT, run_alone
+from tests.experiments.create_runs import parameters
 
 X64, STRICT = {"JAX_ENABLE_X64": "1"}, {"JAX_NUMPY_DTYPE_PROMOTION": "strict"}
 
@@ -285,8 +284,6 @@ def test_commands_work_and_save_32_bits(name: str, tmp_path: Path) -> None:
         of_run = (f"--run={path}", "--sets=test", "--episodes=4")
         new = (SMOKE, f"--workdir={path}", f"--runs={tmp_path / 'runs'}")
         more = of_run if module == "evaluate" else new
-        run_alone(module, *flags, *more, environment={**OPTIMIZED, **switches})
+        run_alone(module, *flags, *more, environment=ENVIRONMENT | switches)
     for member in sorted(path.glob("members/*")) or [path]:
-        checkpointer = Checkpointer(member / "checkpoints")
-        assert checkpointer.steps("latest")
-        assert saved(member, "latest")
+        assert {x.dtype for x in parameters(member).values()} == {np.dtype(np.float32)}

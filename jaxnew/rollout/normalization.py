@@ -42,7 +42,8 @@ class RunningStatistics:
         """
         size = batch.shape[0]
         count = self.count + size
-        share, rest = size / count, self.count / count  # Of the batch, and 1 less it, uncancelled.
+        share = size / count
+        rest = share * (self.count / size)  # 1 - share, without cancellation.
         batch_mean, batch_variance = jnp.mean(batch, axis=0), jnp.var(batch, axis=0)
 
         def moved(old: jax.Array, new: jax.Array) -> jax.Array:
