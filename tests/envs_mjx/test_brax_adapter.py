@@ -239,7 +239,11 @@ class Still:
 
 @pytest.mark.contract
 @pytest.mark.parametrize(
-    ("house", "num_actions"), [(Recommender(), 10_000), (ShapeStacking(Still()), 810)]
+    ("house", "num_actions"),
+    [
+        (Recommender(), 10_000),
+        pytest.param(ShapeStacking(Still()), 810, marks=pytest.mark.slow),
+    ],
 )
 def test_the_other_environments_too(house: Environment, num_actions: int) -> None:
     env = BraxEnvironment(house, range(0, num_actions, num_actions // 30))

@@ -26,6 +26,7 @@ def base() -> TrainConfig:
     return train_config(domain, "ours", "gt12", table, domain.task.stage_two["paper"], 31)
 
 
+@pytest.mark.slow
 @pytest.mark.integration
 def test_on_eight_devices_members_equal_single_runs_after_one_update() -> None:
     # Programs that are not optimized are not as alike.

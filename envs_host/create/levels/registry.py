@@ -127,6 +127,8 @@ def _read_file(path: Path) -> Level:
         )
     try:
         text = read_text(path)
-    except (OSError, ValueError) as err:
-        raise LevelError(f"{path} cannot be read as text: {err}.") from err
+    except OSError as err:
+        raise LevelError(f"{path} cannot be read: {err.strerror}.") from err
+    except ValueError as err:
+        raise LevelError(str(err)) from err
     return parse_level(text, str(path))

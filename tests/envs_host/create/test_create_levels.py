@@ -281,7 +281,7 @@ def test_what_is_no_json_or_no_level_is_refused(tmp_path: Path) -> None:
     with pytest.raises(LevelError, match="is no file"):
         load_level(tmp_path / "absent.json")
     (tmp_path / "latin.json").write_bytes(b'{"name": "\xfc"}')
-    with pytest.raises(LevelError, match=r"latin\.json cannot be read as text: 'utf-8' codec"):
+    with pytest.raises(LevelError, match=r"latin\.json is no UTF-8 text .*; save it as UTF-8"):
         load_level(tmp_path / "latin.json")
     with pytest.raises(LevelError, match="the text is not JSON: maximum recursion depth"):
         parse_level("[" * 100_000)

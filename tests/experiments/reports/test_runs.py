@@ -101,19 +101,19 @@ def test_another_split_is_not_compared_with_the_paper(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("before", "after", "says"),
     [
-        ('{"', "{", r"test-best-sampled-m50\.json is damaged \(Expecting"),
+        ('{"', "{", r"test-best-sampled-m50-\w{8}\.json is damaged \(Expecting"),
         (
             '"mean": 0.5',
             '"mean": 0.6',
-            r"m50\.json was edited or damaged: its hash is [0-9a-f]{16}",
+            r"m50-\w{8}\.json was edited or damaged: its hash is [0-9a-f]{16}",
         ),
         # As 0.2.0 wrote it, and then altered.
         (
             '"mean": 0.5',
             '"mean": 0.9',
-            r"m50\.json is damaged: the mean of is_success, 0\.9, is not",
+            r"m50-\w{8}\.json is damaged: the mean of is_success, 0\.9, is not",
         ),
-        ('"low": 0.48', '"low": NaN', r"m50\.json is damaged: .* \[nan, 0\.51\]"),
+        ('"low": 0.48', '"low": NaN', r"m50-\w{8}\.json is damaged: .* \[nan, 0\.51\]"),
     ],
 )
 def test_a_damaged_evaluation_is_named(tmp_path: Path, before: str, after: str, says: str) -> None:
