@@ -265,7 +265,8 @@ class Checkpointer:
                 raise _DamagedError("it does not exist")
         try:
             args = ocp.args.Composite(record=ocp.args.JsonRestore())
-            record = self._orbax.restore(path, args).record
+            with _raised_once():
+                record = self._orbax.restore(path, args).record
             if record.pop("hash") != record_hash(record):
                 raise ValueError("its record is not what was saved")
         except Exception as err:  # Orbax and TensorStore raise many types for damaged files.
@@ -302,7 +303,8 @@ class Checkpointer:
             try:
                 kinds = {name: ocp.RestoreArgs(restore_type=np.ndarray) for name in target}
                 restore = ocp.args.PyTreeRestore(item=target, restore_args=kinds)
-                found = self._orbax.restore(path, ocp.args.Composite(state=restore)).state
+                with _raised_once():
+                    found = self._orbax.restore(path, ocp.args.Composite(state=restore)).state
             except Exception as err:  # As above.
                 raise _failed(path, err) from err
             for name, value in found.items():

@@ -20,12 +20,14 @@ def main() -> None:
     asked = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         drill = drills.Drills(Path(folder), asked.seed)
-        for name in NAMES:
-            getattr(drill, name)(getattr(asked, name))
-    print("\n| drill | end | times |\n|---|---|---|")
-    for name, seen in drill.totals.items():
-        for end, count in sorted(seen.items()):
-            print(f"| {name} | {end} | {count} |")
+        try:
+            for name in NAMES:
+                getattr(drill, name)(getattr(asked, name))
+        finally:
+            print("\n| drill | end | times |\n|---|---|---|")
+            for name, seen in drill.totals.items():
+                for end, count in sorted(seen.items()):
+                    print(f"| {name} | {end} | {count} |")
 
 
 if __name__ == "__main__":

@@ -95,7 +95,7 @@ class Drills:
             runs = self._folder("disk")
             with small_disk(runs, int(whole * rng.uniform(0.1, 0.8))) as grow:
                 with started(name, runs) as process:
-                    output = "".join(process.communicate())
+                    output, _ = process.communicate()
                 if process.returncode == 0:
                     continue  # It had room: nothing was seen.
                 assert "Traceback" not in output, self._told(name, output)

@@ -178,6 +178,23 @@ def test_a_full_disk_is_told_in_one_line(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.unit
+def test_damage_is_told_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Threads of Orbax go on after an error of reading, too."""
+    printed: list[str] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda told: printed.append(str(told.exc_value)))
+    checkpointer, state = Checkpointer(tmp_path), {"a": np.arange(3)}
+    for step in (1, 2):
+        checkpointer.save("latest", step, state)
+    for file in (tmp_path / "latest" / "000000000002" / "state").rglob("*"):
+        if file.is_file():
+            file.write_bytes(b"")
+    with pytest.warns(UserWarning, match=r"0002 is damaged .*; using step 1"):
+        checkpointer.restore("latest", state)
+    sys.unraisablehook(SimpleNamespace(exc_value=RuntimeError("Event loop is closed")))  # type: ignore[arg-type]
+    assert printed == []
+
+
+@pytest.mark.unit
 def test_damaged_ones_are_set_aside_and_kept(tmp_path: Path) -> None:
     checkpointer, states = Checkpointer(tmp_path), [{"a": np.full(3, i)} for i in range(4)]
     for step in (1, 2, 3):
