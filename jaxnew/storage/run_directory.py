@@ -108,7 +108,7 @@ def _read_object(path: Path) -> dict[str, Any]:
 
 
 def _hash_of(content: Mapping[str, Any]) -> str:
-    """Of an evaluation, as it is written beside it."""
+    """Of a configuration or an evaluation, as it is recorded."""
     return hashlib.sha256(json.dumps(content).encode()).hexdigest()[:16]
 
 
@@ -195,7 +195,7 @@ class RunDirectory:
         check_name(path)
         with access(path):
             _check_marker(path)
-            return cls(path, _read_object(path / "config.json"), True, None)
+            return cls(path, _recorded_config(path), True, None)
 
     @property
     def is_writable(self) -> bool:
@@ -326,6 +326,18 @@ def _check_marker(path: Path) -> None:
         )
 
 
+def _recorded_config(path: Path) -> dict[str, Any]:
+    """The configuration of a run, checked to be what was written; before 0.3.0 none had a hash."""
+    config = _read_object(path / "config.json")
+    recorded = _read_object(path / "provenance.json").get("config_hash")
+    if recorded not in (None, _hash_of(config)):
+        raise RunDirectoryError(
+            f"{path / 'config.json'} was edited or damaged: its hash is {_hash_of(config)}, "
+            f"provenance.json says {recorded}. Restore it from a copy."
+        )
+    return config
+
+
 def _resume(
     cls: type[RunDirectory],
     path: Path,
@@ -333,7 +345,7 @@ def _resume(
     upgrade: Callable[[Mapping[str, Any]], Mapping[str, Any]],
 ) -> RunDirectory:
     _check_marker(path)
-    found = differences(upgrade(_read_object(path / "config.json")), config)
+    found = differences(upgrade(_recorded_config(path)), config)
     if found:
         raise ConfigMismatch(path, found)
     for name in (*_FOLDERS, *_OF_SWEEPS):
@@ -372,7 +384,7 @@ def _make(path: Path, config: dict[str, Any]) -> tuple[Path, int]:
             for name in _FOLDERS:
                 (folder / name).mkdir()
             marker = {"kind": _KIND, "format_version": _FORMAT_VERSION, "has_been_saved": False}
-            marker |= {"sessions": []}
+            marker |= {"config_hash": _hash_of(config), "sessions": []}
             write_json_atomically(folder / "provenance.json", marker)
             write_json_atomically(folder / "config.json", config)
         except BaseException:

@@ -160,6 +160,9 @@ def evaluated_few(runs: Path, trained_few: dict[str, str]) -> dict[str, str]:
     config["task"] = "create-push-no-subgoals"
     config["environment"]["rewards"]["with_subgoals"] = False
     (twin / "config.json").write_text(json.dumps(config))
+    provenance = read_json(twin / "provenance.json")
+    del provenance["config_hash"]
+    (twin / "provenance.json").write_text(json.dumps(provenance))
     flags = ("--sets=train", "--episodes=20")
     more = {f"{name} on train": (f"--run={runs / name}", *flags) for name in ("push", "twin")}
     return evaluate(runs, FEW, more | {"new tools": new_tools(runs)})

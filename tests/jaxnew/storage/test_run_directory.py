@@ -100,6 +100,22 @@ def test_overwrite_starts_anew(tmp_path: Path) -> None:
 
 
 @pytest.mark.unit
+def test_a_config_that_was_altered_is_no_other_run(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    RunDirectory.open_or_create(path, CONFIG).close()
+    file = path / "config.json"
+    written = file.read_text()
+    file.write_text(written.replace("1", "2", 1))
+    message = r"config\.json was edited or damaged: its hash is [0-9a-f]{16}, .* from a copy"
+    with pytest.raises(RunDirectoryError, match=message):
+        RunDirectory.load(path)
+    with pytest.raises(RunDirectoryError, match=message):
+        RunDirectory.open_or_create(path, CONFIG)
+    file.write_text(written)
+    assert RunDirectory.load(path).config["seed"] == 1
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize("overwrite", [False, True])
 def test_other_directories_are_left_alone(tmp_path: Path, overwrite: bool) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
