@@ -54,9 +54,8 @@ def test_commands_run_in_a_folder_with_experiments_of_the_users_own(
     flags = ("--task=mine:TASK", "--representation=gt5", "--budget=smoke")
     assert "update 4 of 4" in run(installed, tmp_path, console, "train", *flags)
     path = tmp_path / "runs" / "mine" / "ours-gt5-default-smoke-31"
-    assert "test (16 episodes" in run(
-        installed, tmp_path, console, "evaluate", f"--run={path}", "--episodes=16"
-    )
+    flags = (f"--run={path}", "--episodes=16", "--trust")
+    assert "16 sampled episodes" in run(installed, tmp_path, console, "evaluate", *flags)
     # `figures` trains what is missing in processes of their own.
     dry = run(installed, tmp_path, console, "figures", "--figure=6", "--budget=smoke", "--dry_run")
     assert "sweep" in dry

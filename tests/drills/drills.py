@@ -16,6 +16,7 @@ import shutil
 import signal
 import subprocess
 import time
+import warnings
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -153,7 +154,10 @@ class Drills:
             what = damage(path, rng)
             before = contents(run)
             module, *flags = self._uses(name, run)[rng.integers(3)]
-            output, has_failed = as_user(module, flags)
+            with warnings.catch_warnings(record=True) as warned:
+                warnings.simplefilter("always", UserWarning)
+                output, has_failed = as_user(module, flags)
+            output += "".join(f"{each.message}\n" for each in warned)
             told = self._told(name, f"{what} {path.relative_to(run)}, {module}: {output}")
             assert "Traceback" not in output, told
             kept = contents(run)
