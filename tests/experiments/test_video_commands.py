@@ -22,7 +22,7 @@ from jaxnew.storage.checkpoint import Checkpointer
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError
 from tests import video_task
-from tests.experiments.commands import evaluation, read_json, run, run_alone
+from tests.experiments.commands import compiling, evaluation, read_json, run, run_alone
 
 PLACE = "--task=tests.video_task:TASK"
 COMMON = (PLACE, "--representation=hvae-video", "--budget=smoke")
@@ -92,9 +92,11 @@ def test_both_ways_and_a_resumed_run_give_the_same_bits(
         return gather(self, rows, numbers)
 
     def train(stores: bool) -> Path:
-        return embed(
-            domain.task, "hvae-video", budget="smoke", stores_drawn=stores, runs=tmp_path
-        ).path
+        with compiling():  # As the run that it is compared with.
+            encoder = embed(
+                domain.task, "hvae-video", budget="smoke", stores_drawn=stores, runs=tmp_path
+            )
+        return encoder.path
 
     with monkeypatch.context() as patch:
         patch.setattr(kind, "gather", dying)
