@@ -274,7 +274,7 @@ COMMANDS: dict[str, tuple[dict[str, str], list[tuple[str, ...]]]] = {
 }
 
 
-@pytest.mark.slow  # Ten minutes for all of them.
+@pytest.mark.slow  # Some six minutes for all of them.
 @pytest.mark.integration
 @pytest.mark.parametrize("name", COMMANDS)
 def test_commands_work_and_save_32_bits(name: str, tmp_path: Path) -> None:

@@ -21,7 +21,7 @@ from typing import Any
 import jax
 
 from experiments.flags import Arguments
-from jaxnew.storage.run_directory import describe_session
+from jaxnew.storage.session import describe_session
 
 RATIO = "time of the first over time of the second"
 

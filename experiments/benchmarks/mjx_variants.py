@@ -33,7 +33,7 @@ from envs_mjx.shape_stacking.shapes import NUM_SHAPES
 from envs_mjx.shape_stacking.solids import DOME_AXIS_HEIGHT, solids
 from experiments.benchmarks import _measure as m
 from experiments.untrained import towers as stacking
-from jaxnew.storage.run_directory import describe_session
+from jaxnew.storage.session import describe_session
 
 ARGUMENTS = m.Benchmark(__doc__)
 ARGUMENTS.define("integer", "worlds", 6, "Worlds of each stage of random play.", lower_bound=1)

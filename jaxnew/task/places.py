@@ -126,19 +126,6 @@ def check_output(folder: Path | str, instead: str = "choose another folder") -> 
         ) from err
 
 
-def check_output_file(path: Path | str) -> Path:
-    """`check_output` of a file: of the folder that it is to lie in.
-
-    Raises:
-      UsageError: nothing can be written there, or `path` is a folder.
-    """
-    path = Path(path)
-    if path.is_dir():
-        raise UsageError(f"{path} is a folder; give the name of a file in it.")
-    check_output(path.parent)
-    return path
-
-
 def budget_of(presets: Mapping[str, Budget], name: str, what: str) -> Budget:
     """The preset called `name`.
 

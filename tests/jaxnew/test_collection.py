@@ -24,14 +24,11 @@ from jaxnew.actions import ActionUniverse
 from jaxnew.collection import collect, load
 from jaxnew.observations import ObservationsError, RecordingFormat, Recordings, action_rng
 from jaxnew.storage.files import take_lock
+from tests.kills import Killed, dying
 
 ROOT = Path(__file__).resolve().parents[2]
 NUM_ACTIONS, NUM_RECORDINGS = 23, 4
 FORMAT = RecordingFormat("Toy-v0 play", (3, 2), "uint8", 0, 200)
-
-
-class Killed(BaseException):
-    """Stands for the end of the process."""
 
 
 def make_universe(name: str = "Toy-v0") -> ActionUniverse:
@@ -122,18 +119,7 @@ def test_the_recorder_always_gets_blocks_of_one_size(tmp_path: Path) -> None:
 def test_killed_at_every_instant_and_resumed(tmp_path: Path) -> None:
     gather(tmp_path / "whole")
     for at in range(50):
-        path, count, is_killed = tmp_path / str(at), 0, False
-
-        def dies(real: Any, at: int = at) -> Any:
-            def function(*arguments: Any, **named: Any) -> Any:
-                nonlocal count
-                count += 1
-                if count > at:
-                    raise Killed
-                return real(*arguments, **named)
-
-            return function
-
+        path, is_killed, dies = tmp_path / str(at), False, dying(at)
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(os, "replace", dies(os.replace))
             patch.setattr(os, "fsync", dies(os.fsync))

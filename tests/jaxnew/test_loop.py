@@ -30,16 +30,13 @@ from jaxnew import loop
 from jaxnew.storage import metrics
 from jaxnew.storage.checkpoint import Checkpointer, CheckpointError
 from jaxnew.storage.run_directory import RunDirectory
+from tests.kills import Killed
 
 ROOT = Path(__file__).resolve().parents[2]
 RHYTHM = loop.Rhythm(total_steps=47, chunk_steps=5, checkpoint_every=10, evaluate_every=5)
 DISPLAY = loop.Display("toy")
 OPTIMIZER = optax.adam(1e-2)
 TRACED: list[int] = []
-
-
-class Killed(BaseException):
-    """Stands for the end of the process."""
 
 
 @struct.dataclass

@@ -10,6 +10,7 @@ import resource
 import shutil
 import sys
 import warnings
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -24,6 +25,7 @@ from flax import struct
 
 from jaxnew.storage.checkpoint import Checkpointer, CheckpointError, record_hash
 from jaxnew.storage.files import StorageError
+from tests.kills import Killed, is_killed
 
 
 @struct.dataclass
@@ -367,37 +369,22 @@ def test_another_format_is_an_error(tmp_path: Path) -> None:
         Checkpointer(tmp_path).restore("best", {"a": jnp.zeros(2)})
 
 
-class Killed(BaseException):
-    """Stands for the end of the process."""
-
-
 @pytest.mark.unit
 def test_a_save_killed_at_any_rename_or_deletion_leaves_the_newest_readable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
     example = {"a": jnp.float32(0)}
     for call in range(40):
         folder = tmp_path / str(call)
-        calls, step = [0], 0
+        checkpointer, step = Checkpointer(folder), 0
 
-        def dying(real: Any, calls: list[int] = calls, call: int = call) -> Any:
-            def function(*arguments: Any, **named: Any) -> Any:
-                calls[0] += 1
-                if calls[0] > call:
-                    raise Killed
-                return real(*arguments, **named)
+        def save(checkpointer: Checkpointer = checkpointer) -> None:
+            nonlocal step
+            for step in range(1, 5):
+                checkpointer.save("latest", step, {"a": jnp.float32(step)}, {"step": step})
 
-            return function
-
-        with monkeypatch.context() as patch:
-            for module, name in ((os, "rename"), (os, "replace"), (shutil, "rmtree")):
-                patch.setattr(module, name, dying(getattr(module, name)))
-            checkpointer, is_killed = Checkpointer(folder), False
-            try:
-                for step in range(1, 5):
-                    checkpointer.save("latest", step, {"a": jnp.float32(step)}, {"step": step})
-            except Killed:
-                is_killed = True
+        renames = ((os, "rename"), (os, "replace"), (shutil, "rmtree"))
+        was_killed = is_killed(save, call, renames)
         after = Checkpointer(folder)
         committed = after.steps("latest")
         # The save in flight counts or does not; the one before it is there in either case.
@@ -407,7 +394,7 @@ def test_a_save_killed_at_any_rename_or_deletion_leaves_the_newest_readable(
             assert float(restored["a"]) == metadata["step"] == committed[-1]
         after.save("latest", 9, example)
         assert all(name.isdecimal() for name in os.listdir(folder / "latest"))
-        if not is_killed:
+        if not was_killed:
             assert call > 4  # Every instant was tried.
             return
     pytest.fail("40 calls were not enough")
@@ -415,39 +402,24 @@ def test_a_save_killed_at_any_rename_or_deletion_leaves_the_newest_readable(
 
 @pytest.mark.unit
 @pytest.mark.parametrize("what", ["discard", "set aside"])
-def test_discarding_killed_anywhere_leaves_the_rest_readable(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
-) -> None:
+def test_discarding_killed_anywhere_leaves_the_rest_readable(tmp_path: Path, what: str) -> None:
     example = {"a": jnp.float32(0)}
     for step in (1, 2, 3):
         Checkpointer(tmp_path / "whole").save("best", step, {"a": jnp.float32(step)})
     for step in (2, 3) if what == "set aside" else ():
         damage_record(tmp_path / "whole" / "best" / f"{step:012d}")
     for call in itertools.count():
-        folder, calls = tmp_path / str(call), [0]
+        folder = tmp_path / str(call)
         shutil.copytree(tmp_path / "whole", folder)
 
-        def dying(real: Any, calls: list[int] = calls, call: int = call) -> Any:
-            def function(*arguments: Any, **named: Any) -> Any:
-                calls[0] += 1
-                if calls[0] > call:
-                    raise Killed
-                return real(*arguments, **named)
-
-            return function
-
-        with monkeypatch.context() as patch, warnings.catch_warnings(action="ignore"):
-            for name in ("rename", "unlink", "rmdir"):
-                patch.setattr(os, name, dying(getattr(os, name)))
-            try:
-                if what == "discard":
-                    Checkpointer(folder).discard_after(1)
-                else:
-                    Checkpointer(folder).set_aside_damaged("best", example)
-            except Killed:
-                is_killed = True
-            else:
-                is_killed = False
+        checkpointer = Checkpointer(folder)
+        work = (
+            partial(checkpointer.discard_after, 1)
+            if what == "discard"
+            else partial(checkpointer.set_aside_damaged, "best", example)
+        )
+        with warnings.catch_warnings(action="ignore"):
+            was_killed = is_killed(work, call, [(os, n) for n in ("rename", "unlink", "rmdir")])
         after = Checkpointer(folder)
         assert after.steps("best")[0] == 1
         after.clean("best")
@@ -457,7 +429,7 @@ def test_discarding_killed_anywhere_leaves_the_rest_readable(
         left = [name for name in os.listdir(folder / "best") if not name.isdecimal()]
         assert all(name.startswith("damaged-") for name in left)
         assert len(left) + len(after.steps("best")) == 3 or what == "discard"
-        if not is_killed:
+        if not was_killed:
             assert after.steps("best") == [1]
             assert call > 1  # Every instant was tried.
             return

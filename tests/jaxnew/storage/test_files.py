@@ -30,6 +30,7 @@ from jaxnew.storage.files import (
     write_json_atomically,
 )
 from jaxnew.storage.run_directory import RunDirectory
+from tests.kills import is_killed
 
 SPLIT = ActionSplit(np.arange(2), np.array([2]), np.array([3]), "universe")
 READERS = {
@@ -38,10 +39,6 @@ READERS = {
     "recordings.npz": Recordings.load,
     "metrics.jsonl": metrics.read,
 }
-
-
-class Killed(BaseException):
-    """Stands for the end of the process."""
 
 
 @contextlib.contextmanager
@@ -162,35 +159,16 @@ def test_a_damaged_split_is_named(tmp_path: Path, content: Any, says: str) -> No
 
 
 @pytest.mark.unit
-def test_a_file_is_whole_wherever_its_writing_is_killed(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_is_whole_wherever_its_writing_is_killed(tmp_path: Path) -> None:
     file = tmp_path / "a.json"
     functions = [(os, "replace"), (os, "unlink"), (os, "fsync"), (os, "chmod")]
     for call in range(12):
         write_json_atomically(file, {"a": 1})
-        calls, is_killed = [0], False
-
-        def dying(real: Any, calls: list[int] = calls, call: int = call) -> Any:
-            def function(*arguments: Any, **named: Any) -> Any:
-                calls[0] += 1
-                if calls[0] > call:
-                    raise Killed
-                return real(*arguments, **named)
-
-            return function
-
-        with monkeypatch.context() as patch:
-            for module, name in functions:
-                patch.setattr(module, name, dying(getattr(module, name)))
-            try:
-                write_json_atomically(file, {"a": 2})
-            except Killed:
-                is_killed = True
+        was_killed = is_killed(lambda: write_json_atomically(file, {"a": 2}), call, functions)
         assert read_json(file, ValueError) in ({"a": 1}, {"a": 2})
         remove_temporaries(tmp_path)
         assert os.listdir(tmp_path) == ["a.json"]
-        if not is_killed:
+        if not was_killed:
             assert call > 3  # Every instant was tried.
             return
     pytest.fail("12 calls were not enough")

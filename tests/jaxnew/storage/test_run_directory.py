@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -20,13 +19,10 @@ from jaxnew.storage.run_directory import (
     RunDirectoryError,
     RunDirectoryInUse,
 )
+from tests.kills import Killed
 
 ROOT = Path(__file__).resolve().parents[3]
 CONFIG = {"seed": 1, "ppo": {"rate": 0.5, "layers": (1, 2)}}
-
-
-class Killed(BaseException):
-    """Stands for the end of the process."""
 
 
 def make(path: Path, config: dict[str, Any] = CONFIG) -> None:
@@ -141,46 +137,6 @@ def test_overwrite_does_not_follow_links(tmp_path: Path) -> None:
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("function", ["rename", "rmtree"])
-@pytest.mark.parametrize("call", [0, 1, 2])
-def test_an_overwrite_killed_anywhere_loses_neither_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, function: str, call: int
-) -> None:
-    make(tmp_path / "run")
-    (tmp_path / "run" / "metrics.jsonl").write_text("old")
-    module = os if function == "rename" else shutil
-    real, calls = getattr(module, function), [0]
-
-    def dies(*arguments: Any, **named: Any) -> Any:
-        calls[0] += 1
-        if calls[0] > call:  # Nothing happens on disk once the process is dead.
-            raise Killed
-        return real(*arguments, **named)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(module, function, dies)
-        try:
-            RunDirectory.open_or_create(tmp_path / "run", {"seed": 2}, overwrite=True).close()
-        except Killed:
-            pass
-        else:
-            # Fewer calls than `call`: the overwrite was complete.
-            assert calls[0] <= call
-    for config, old in ((CONFIG, True), ({"seed": 2}, False)):
-        try:
-            with RunDirectory.open_or_create(tmp_path / "run", config) as run:
-                is_old = run.config["seed"] == 1
-        except ConfigMismatch:
-            continue
-        assert is_old == old
-        assert (tmp_path / "run" / "metrics.jsonl").exists() == old
-        assert run.is_resumed
-        break
-    else:
-        pytest.fail("neither run is there")
-
-
-@pytest.mark.unit
 @pytest.mark.parametrize("content", ["", "{", "[1]", "\x00\xff"])
 def test_a_damaged_configuration_is_named(tmp_path: Path, content: str) -> None:
     make(tmp_path)
@@ -249,6 +205,7 @@ def test_the_lock_holds_within_a_process_and_is_released(tmp_path: Path) -> None
 HOLDER = """
 import sys, time
 from jaxnew.storage.run_directory import RunDirectory
+from tests.kills import Killed
 run = RunDirectory.open_or_create(sys.argv[1], {"seed": 1})
 print("locked", flush=True)
 time.sleep(60)

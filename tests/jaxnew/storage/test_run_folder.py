@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,14 +16,11 @@ import pytest
 from jaxnew.storage import run_directory as run_directory_lib
 from jaxnew.storage.files import StorageError, take_lock
 from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory, RunDirectoryError
+from tests.kills import is_killed
 
 OLD, NEW = {"seed": 1}, {"seed": 2}
 DISK = [(os, name) for name in ("rename", "replace", "unlink", "rmdir", "mkdir", "chmod")]
 DISK.append((shutil, "rmtree"))
-
-
-class Killed(BaseException):
-    """Stands for the end of the process."""
 
 
 @pytest.fixture(autouse=True)
@@ -37,28 +35,8 @@ def make(path: Path, config: dict[str, Any] = OLD) -> None:
             (path / "metrics.jsonl").write_text('{"step": 1}\n')
 
 
-def is_killed(path: Path, overwrite: bool, call: int) -> bool:
-    """Opens for NEW, killed after so many changes of the disk; whether that was before its end."""
-    calls = 0
-
-    def dying(real: Any) -> Any:
-        def function(*arguments: Any, **named: Any) -> Any:
-            nonlocal calls
-            calls += 1
-            if calls > call:  # Nothing happens on disk once the process is dead.
-                raise Killed
-            return real(*arguments, **named)
-
-        return function
-
-    with pytest.MonkeyPatch.context() as patch:
-        for module, name in DISK:
-            patch.setattr(module, name, dying(getattr(module, name)))
-        try:
-            RunDirectory.open_or_create(path, NEW, overwrite).close()
-        except Killed:
-            return True
-    return False
+def open_new(path: Path, overwrite: bool) -> None:
+    RunDirectory.open_or_create(path, NEW, overwrite).close()
 
 
 def kills(parent: Path, has_old: bool, overwrite: bool) -> Iterator[Path]:
@@ -68,7 +46,8 @@ def kills(parent: Path, has_old: bool, overwrite: bool) -> Iterator[Path]:
         path.parent.mkdir()
         if has_old:
             make(path)
-        if not is_killed(path, overwrite, call):
+        work = partial(open_new, path, overwrite)
+        if not is_killed(work, call, DISK):
             assert call > 8  # Every instant was tried.
             return
         yield path
