@@ -2,8 +2,8 @@
 
 from jaxnew.actions import ActionSplit as ActionSplit
 from jaxnew.actions import ActionUniverse as ActionUniverse
-from jaxnew.checks import check_environment as check_environment
-from jaxnew.checks import check_method as check_method
+from jaxnew.checks.environment import check_environment as check_environment
+from jaxnew.checks.policy import check_method as check_method
 from jaxnew.embedding import Encoder as Encoder
 from jaxnew.embedding import embed as embed
 from jaxnew.environment import Action as Action

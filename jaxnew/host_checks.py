@@ -102,14 +102,14 @@ def _played(env: Any, seed: int) -> list[np.ndarray]:
     try:
         observation = env.reset(np.random.SeedSequence(seed))
     except Exception as err:
-        raise ValueError(f"{name}.reset fails: {type(err).__name__}: {_line(err)}") from err
+        raise ValueError(f"{name}.reset fails: {type(err).__name__}: {first_line(err)}") from err
     found = [_finite(f"{name}.reset", env, observation)]
     for _ in range(_NUM_STEPS):
         position = rng.uniform(-1.0, 1.0, env.position_dim).astype(np.float32)
         try:
             step = env.step(0, position)
         except Exception as err:
-            raise ValueError(f"{name}.step fails: {type(err).__name__}: {_line(err)}") from err
+            raise ValueError(f"{name}.step fails: {type(err).__name__}: {first_line(err)}") from err
         observation, reward, terminated, truncated, metrics = checked_step(
             f"{name}.step", step, names
         )
@@ -136,5 +136,6 @@ def _form(found: Any) -> str:
     return f"{found!r}, a {type(found).__name__}"
 
 
-def _line(err: object) -> str:
+def first_line(err: object) -> str:
+    """The first line of what an error says."""
     return str(err).strip().partition("\n")[0]

@@ -20,7 +20,7 @@ import numpy as np
 from flax import struct
 
 from jaxnew import loop
-from jaxnew.checks import check_run
+from jaxnew.checks.run import check_run
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.finiteness import CAUSES, PREFIX, cause_of
 from jaxnew.ppo import Hyperparameters, TrainState

@@ -12,7 +12,7 @@ import numpy as np
 
 from jaxnew import loop
 from jaxnew.actions import ActionSplit, check_same
-from jaxnew.checks import check_run
+from jaxnew.checks.run import check_run
 from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, find_table, is_learned
 from jaxnew.ppo import TrainState
 from jaxnew.representation.table import RepresentationTable

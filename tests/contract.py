@@ -8,7 +8,7 @@ whole list costs one or two compiles:
   contract.check_rewards(rollout, low=0.0, high=1.0)
 
 Each check raises `AssertionError`, or the `UsageError` of `jaxnew.checks`, and says what broke.
-Trees, shapes and dtypes are the business of `jaxnew.checks.check_forms`.
+Trees, shapes and dtypes are the business of `jaxnew.checks.environment.check_forms`.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxnew.checks import check_values
+from jaxnew.checks.environment import check_values
 from jaxnew.environment import Action, Environment, FixedActionSet
 
 SampleAction = Callable[[jax.Array, Environment], Action]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from flax import struct
 
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from jaxnew.environment import (
     Action,
     ActionSpec,

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from examples.kicks import Kicks, KicksState, kick_universe
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from jaxnew.environment import Action
 from tests import contract
 

@@ -15,7 +15,7 @@ import pytest
 from flax import struct
 
 import jaxnew
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from jaxnew.environment import Action, ActionSpec, Environment, ObservationSpec
 from jaxnew.policy.distributions import Categorical
 from jaxnew.representation.table import engineered_table

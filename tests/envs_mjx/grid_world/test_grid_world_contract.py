@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from envs_mjx.grid_world import GridWorld
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from jaxnew.environment import Action, Environment
 from tests import contract
 

@@ -9,7 +9,7 @@ import pytest
 
 from envs_mjx.recommender import Recommender, environment, product_constants, product_vectors
 from envs_mjx.recommender.environment import BANDIT, STOP
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from jaxnew.environment import Action
 from tests import contract
 

@@ -9,7 +9,7 @@ import pytest
 
 from envs_mjx.shape_stacking import ShapeStacking, scene
 from envs_mjx.shape_stacking.engines.mujoco_c import MujocoC
-from jaxnew.checks import check_forms
+from jaxnew.checks.environment import check_forms
 from tests import contract
 
 pytestmark = pytest.mark.contract
