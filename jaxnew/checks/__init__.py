@@ -3,5 +3,6 @@
     jaxnew.check_environment(MyEnvironment())
     jaxnew.check_method(MyMethod(jaxnew.MethodContext()))
 
-`train` and `sweep` run them before they compile; of what an installed package brings, the forms.
+`train` and `sweep` run them before they compile, on the host through a small pool. Of environments
+that an installed package brings, they look at the forms of those inside jit alone.
 """

@@ -6,6 +6,7 @@ import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax
@@ -16,12 +17,14 @@ from flax import struct
 
 import jaxnew
 from jaxnew.checks.environment import check_forms
+from jaxnew.checks.run import check_run
 from jaxnew.environment import Action, ActionSpec, Environment, ObservationSpec
 from jaxnew.policy.distributions import Categorical
 from jaxnew.representation.table import engineered_table
 from jaxnew.task.places import UsageError
-from tests import toy_device
-from tests.toy_host import ToyEnv
+from jaxnew.task.task import Task
+from tests import toy_device, toy_task
+from tests.toy_host import ToyEnv, ToyPool
 
 pytestmark = pytest.mark.contract
 
@@ -467,3 +470,52 @@ def test_sound_environments_for_the_pool() -> None:
     jaxnew.check_environment(SoundHost())
     with pytest.raises(UsageError, match=r"object lacks .*see envs_host.protocol.HostEnvironment"):
         jaxnew.check_environment(object())
+
+
+def made_of(env: type, **changes: Any) -> Task:
+    """The toy task with environments of that class, in pools with these members."""
+    pool = type("MyPool", (ToyPool,), {"make_env": env, **changes})
+    host = toy_task.TASK.host
+    assert host is not None
+    return replace(
+        toy_task.TASK, host=replace(host, make_pool=lambda **arguments: pool(**arguments))
+    )
+
+
+POOLS: dict[str, tuple[dict[str, Any], str]] = {
+    "reward": (host_step(reward=lambda x: np.nan), "step: an observation or a reward is NaN"),
+    "chance": ({"reset": reset_with_chance}, "The same seed .* gave other episodes"),
+    "shape": ({}, r"have observations uint8\[16, 16\] .*; the task's .* say uint8\[8, 8\] and 2"),
+    "positions": ({}, r"positions of 2 numbers; the task's .* say uint8\[16, 16\] and 3"),
+}
+
+
+@pytest.mark.parametrize("what", POOLS)
+def test_runs_of_mistakes_on_the_host_do_not_begin(what: str, tmp_path: Path) -> None:
+    mistake, message = POOLS[what]
+    task = made_of(type("Mine", (ToyEnv,), mistake))
+    assert task.host is not None
+    said = {
+        "shape": {"observation_spec": ObservationSpec((8, 8), np.uint8, 0, 255)},
+        "positions": {"action_spec": ActionSpec(toy_task.A, position_dim=3)},
+    }
+    task = replace(task, host=replace(task.host, **said.get(what, {})))
+    with pytest.raises(UsageError, match=message):
+        jaxnew.train(task, "gt4", budget="smoke", runs=tmp_path)
+    assert list(tmp_path.rglob("config.json")) == []
+
+
+def test_a_pool_is_tried_once_and_closed() -> None:
+    pools: list[ToyPool] = []
+
+    def make_pool(**arguments: Any) -> ToyPool:
+        pools.append(ToyPool(**arguments))
+        return pools[-1]
+
+    host = toy_task.TASK.host
+    assert host is not None
+    task = replace(toy_task.TASK, host=replace(host, make_pool=make_pool))
+    rollout: Any = SimpleNamespace(method=None)
+    for _ in range(2):
+        check_run(task, rollout, "ours", np.zeros((toy_task.A, 4), np.float32))
+    assert [pool.is_closed for pool in pools] == [True]
