@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
+# Recordings per action in a gradient step of the paper's settings.
+PAPER_RECORDINGS = 672
 KINDS = ("hvae", "vae")
 
 
@@ -24,8 +26,20 @@ class RepresentationConfig:
       recordings_per_action: S, recordings of each per gradient step. The flat VAE draws
         `A_train * floor(B * S / A_train)` recordings instead.
       num_steps: gradient steps of the whole training. The flat VAE's reference is 10,000.
-      learning_rate: of RAdam, constant.
+      learning_rate: of RAdam.
       gradient_clip: every gradient entry is clamped to +- this.
+      decays_learning_rate: constant for half of the steps, then linearly to a hundredth; False:
+        constant.
+      has_optimal_variance: the Gaussian likelihood has the variance that fits the batch's errors
+        best, see `objective.optimal_log_variance`; False: one that is learned.
+      normalizes_log_variance: the log-variance of q(c | O) passes through the scalar batch norm
+        together with the mean; False: as the network gives it (HVAE only).
+      kl_recordings: n, the action's divergence counts 1/n per recording, as if each action had n
+        recordings in the batch; None: as many as it has (HVAE only).
+      standardizes: encoder and decoder read and write vectors in units of their mean, deviation and
+        step size, see `encoders.Scales`; False: as they are.
+      predicts_changes: the decoder adds what it gives to the last step; False: it gives the step.
+      reads_changes: the encoder reads how far each step is from the one before, too.
 
     Raises:
       TypeError: a count is not an integer.
@@ -43,15 +57,22 @@ class RepresentationConfig:
     num_steps: int = 40_000
     learning_rate: float = 1e-3
     gradient_clip: float = 0.5
+    decays_learning_rate: bool = False
+    has_optimal_variance: bool = False
+    normalizes_log_variance: bool = True
+    kl_recordings: int | None = None
+    standardizes: bool = False
+    predicts_changes: bool = False
+    reads_changes: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
             raise ValueError(f"kind={self.kind!r} is unknown; choose one of {KINDS}.")
         for field in fields(self):
-            value = getattr(self, field.name)
-            if isinstance(field.default, str):
+            value, kind = getattr(self, field.name), str(field.type)
+            if value is None or kind in ("str", "bool"):
                 continue
-            if isinstance(field.default, int) and not isinstance(value, int):
+            if kind.startswith("int") and not isinstance(value, int):
                 raise TypeError(f"{field.name}={value!r} must be an integer.")
             if not value > 0:
                 raise ValueError(f"{field.name}={value!r} must be positive.")

@@ -6,7 +6,14 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew.representation.encoders import Dense, LSTMWeights, ResBlock, lstm_cell
+from jaxnew.representation.encoders import (
+    AS_GIVEN,
+    Dense,
+    LSTMWeights,
+    ResBlock,
+    Scales,
+    lstm_cell,
+)
 
 
 class DecoderStart(nn.Module):
@@ -40,19 +47,24 @@ class TrajectoryDecoder(nn.Module):
     Attributes:
       width: H.
       pytorch_init: see `Dense`.
+      predicts_changes: see `RepresentationConfig`.
     """
 
     width: int
     pytorch_init: bool = False
+    predicts_changes: bool = False
 
     @nn.compact
-    def __call__(self, g: jax.Array, first_step: jax.Array, num_steps: int) -> jax.Array:
+    def __call__(
+        self, g: jax.Array, first_step: jax.Array, num_steps: int, scales: Scales = AS_GIVEN
+    ) -> jax.Array:
         """Decodes.
 
         Args:
           g: f32[H, B, S] from `DecoderStart`.
           first_step: f32[B, S, D] the recordings' true step 0.
           num_steps: T, at least 2.
+          scales: of the D numbers.
         Returns:
           f32[B, S, T-1, D] predicted means (or logits) of steps 1..T-1.
         """
@@ -63,15 +75,22 @@ class TrajectoryDecoder(nn.Module):
         write = Dense(dim, self.pytorch_init, name="write")
         kernel_input, kernel_hidden, bias = LSTMWeights(self.width, name="lstm")(self.width)
         kernel = jnp.concatenate([kernel_input, kernel_hidden]).T
+        scales = Scales(*(jnp.reshape(numbers, (-1, 1)) for numbers in scales))
+
+        def predicted(hidden: jax.Array, last: jax.Array) -> jax.Array:
+            written = write(after(hidden))
+            if self.predicts_changes:
+                return last + scales.change * written
+            return scales.mean + scales.deviation * written
 
         g = g.reshape(self.width, -1)
         step = first_step.reshape(-1, dim).T
-        gates = kernel_input.T @ (g * before(read(step)))
+        gates = kernel_input.T @ (g * before(read(scales.standardized(step))))
         hidden, cell = lstm_cell(gates + bias[:, None], None)
-        predictions = [write(after(hidden))]
+        predictions = [predicted(hidden, step)]
         for _ in range(num_steps - 2):
-            u = g * before(read(predictions[-1]))
+            u = g * before(read(scales.standardized(predictions[-1])))
             gates = kernel @ jnp.concatenate([u, hidden]) + bias[:, None]
             hidden, cell = lstm_cell(gates, cell)
-            predictions.append(write(after(hidden)))
+            predictions.append(predicted(hidden, predictions[-1]))
         return jnp.stack(predictions).transpose(2, 0, 1).reshape(*batch, num_steps - 1, dim)

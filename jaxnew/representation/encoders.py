@@ -12,6 +12,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,6 +24,9 @@ Initializer = Callable[..., jax.Array]
 xavier_normal: Initializer = nn.initializers.variance_scaling(
     2.0, "fan_avg", "normal", dtype=jnp.float32
 )
+
+# Bounds of the likelihood's learned log-variance.
+LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -4.0, 3.0
 
 # Free log-variance vectors start from N(0, 1).
 free_log_variance: Initializer = nn.initializers.normal(1.0, jnp.float32)
@@ -103,6 +107,60 @@ class ScalarBatchNorm(nn.Module):
             use_fast_variance=False,  # E[x^2] - E[x]^2 cancels in float32.
         )
         return norm(x.reshape(-1, 1)).reshape(x.shape)
+
+
+class Scales(NamedTuple):
+    """In which units a recording's numbers are read and written.
+
+    Attributes:
+      mean, deviation: f32[D] over all steps.
+      change: f32[D] root of the mean square of the change from step to step.
+    """
+
+    mean: Any
+    deviation: Any
+    change: Any
+
+    def standardized(self, x: jax.Array) -> jax.Array:
+        """`(x - mean) / deviation`, the D numbers on the axis of the scales."""
+        return (x - self.mean) / self.deviation
+
+
+# The identity.
+AS_GIVEN = Scales(0.0, 1.0, 1.0)
+
+
+class Standardization(nn.Module):
+    """The scales of recordings: those of the batch in training, else their running averages.
+
+    Averages keep 0.99 a step, as in `ScalarBatchNorm`; nothing is learned.
+
+    Attributes:
+      is_active: False gives `AS_GIVEN`.
+    """
+
+    is_active: bool
+
+    @nn.compact
+    def __call__(self, features: jax.Array, training: bool) -> Scales:
+        """f32[B, S, T, D], T at least 2 -> scales."""
+        if not self.is_active:
+            return AS_GIVEN
+        shape = features.shape[-1:]
+        mean = self.variable("batch_stats", "mean", jnp.zeros, shape)
+        variance = self.variable("batch_stats", "variance", jnp.ones, shape)
+        squared_change = self.variable("batch_stats", "squared_change", jnp.ones, shape)
+        kept = (mean, variance, squared_change)
+        if training:
+            axes = tuple(range(features.ndim - 1))
+            changes = jnp.mean(jnp.square(jnp.diff(features, axis=-2)), axes)
+            found = jnp.mean(features, axes), jnp.var(features, axes), changes
+            for old, new in zip(kept, found, strict=True):
+                old.value = 0.99 * old.value + 0.01 * new
+        else:
+            found = mean.value, variance.value, squared_change.value
+        # Numbers that never change are read as zero, and their changes written as nearly zero.
+        return Scales(found[0], *(jnp.sqrt(numbers + 1e-6) for numbers in found[1:]))
 
 
 def lstm_cell(gates: jax.Array, cell: jax.Array | None) -> tuple[jax.Array, jax.Array]:
@@ -194,13 +252,19 @@ class TrajectoryEncoder(nn.Module):
 
     Attributes:
       width: E.
+      reads_changes: see `RepresentationConfig`.
     """
 
     width: int
+    reads_changes: bool = False
 
     @nn.compact
-    def __call__(self, features: jax.Array) -> jax.Array:
+    def __call__(self, features: jax.Array, scales: Scales = AS_GIVEN) -> jax.Array:
         """f32[B, S, T, D] -> f32[E, B, S]."""
+        changes = jnp.diff(features, axis=2, prepend=features[:, :, :1]) / scales.change
+        features = scales.standardized(features)
+        if self.reads_changes:
+            features = jnp.concatenate([features, changes], axis=-1)
         *batch, num_steps, dim = features.shape
         flat = features.reshape(-1, num_steps, dim)
         steps = [flat[:, t].T for t in range(num_steps)]
@@ -235,7 +299,11 @@ class LatentHead(nn.Module):
 
 
 def likelihood_log_variance(module: nn.Module, gaussian_dim: int) -> jax.Array | None:
-    """Registers the likelihood's free log-variance f32[D] in `module`; None where D is 0."""
+    """Registers the likelihood's free log-variance f32[D] in `module`; None where D is 0.
+
+    It is clamped to [-4, 3]; outside, its gradient is zero.
+    """
     if not gaussian_dim:
         return None
-    return module.param("likelihood_log_variance", free_log_variance, (gaussian_dim,))
+    free = module.param("likelihood_log_variance", free_log_variance, (gaussian_dim,))
+    return jnp.clip(free, LOG_VARIANCE_MIN, LOG_VARIANCE_MAX)

@@ -17,6 +17,7 @@ from jaxnew.representation.encoders import (
     LatentHead,
     ResBlock,
     ScalarBatchNorm,
+    Standardization,
     likelihood_log_variance,
 )
 from jaxnew.representation.images import (
@@ -34,10 +35,12 @@ class ActionInference(nn.Module):
     Attributes:
       width: Ho.
       latent: dc.
+      normalizes_log_variance: see `RepresentationConfig`.
     """
 
     width: int
     latent: int
+    normalizes_log_variance: bool = True
 
     @nn.compact
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
@@ -46,7 +49,11 @@ class ActionInference(nn.Module):
         # The release has Lin, then the mean over S. The two commute; this order is cheaper.
         e = Dense(self.width)(jnp.mean(e, axis=-1))
         e = Dense(2 * self.latent)(ResBlock(3)(e))
-        mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2)
+        normalize = ScalarBatchNorm()
+        if not self.normalizes_log_variance:
+            mean, log_variance = jnp.split(e, 2)
+            return normalize(mean, training), log_variance
+        mean, log_variance = jnp.split(normalize(e, training), 2)
         return mean, log_variance
 
 
@@ -98,9 +105,11 @@ class HVAE(nn.Module):
       action_latent: dc.
       observation_latent: dz.
       gaussian_dim: D for a Gaussian likelihood, whose log-variance is a free vector of that length;
-        0 for a categorical one, which has no variance.
+        0 for one without: a categorical one, or where it is that of the batch's errors.
       image_shape: (side, side, channels) where a step of a recording is an image, else None.
       is_still: whether a recording is one image.
+      normalizes_log_variance, standardizes, predicts_changes, reads_changes: see
+        `RepresentationConfig`. Of videos, changes are those of the frames' codes.
     """
 
     encoder_width: int
@@ -111,16 +120,25 @@ class HVAE(nn.Module):
     gaussian_dim: int
     image_shape: tuple[int, int, int] | None = None
     is_still: bool = False
+    normalizes_log_variance: bool = True
+    standardizes: bool = False
+    predicts_changes: bool = False
+    reads_changes: bool = False
 
     def setup(self) -> None:
-        self.encoder = recording_encoder(self.encoder_width, self.image_shape)
-        self.action_inference = ActionInference(self.inference_width, self.action_latent)
+        self.encoder = recording_encoder(self.encoder_width, self.image_shape, self.reads_changes)
+        self.scales = Standardization(self.standardizes and self.image_shape is None)
+        self.action_inference = ActionInference(
+            self.inference_width, self.action_latent, self.normalizes_log_variance
+        )
         self.observation_inference = ObservationInference(
             self.hidden_width, self.observation_latent
         )
         self.latent_prior = LatentPrior(self.hidden_width, self.observation_latent)
         self.decoder_start = DecoderStart(self.hidden_width)
-        self.decoder = recording_decoder(self.hidden_width, self.image_shape, self.is_still)
+        self.decoder = recording_decoder(
+            self.hidden_width, self.image_shape, self.is_still, self.predicts_changes
+        )
         self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
 
     def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
@@ -131,14 +149,16 @@ class HVAE(nn.Module):
           noise: of the two sampled latents.
           training: True normalises with batch statistics and updates the running averages.
         """
-        h, start = encoded(self.encoder, features, training)
+        scales = self.scales(features, training)
+        h, start = encoded(self.encoder, features, scales, training)
         action_mean, action_log_variance = self.action_inference(h, training)
         c = sample_gaussian(action_mean, action_log_variance, noise.action.T)
         z_mean, z_log_variance = self.observation_inference(h, c, training)
         z_noise = jnp.moveaxis(noise.observation, -1, 0)
         z = sample_gaussian(z_mean, z_log_variance[:, None, None], z_noise)
         prior_mean, prior_log_variance = self.latent_prior(c, training)
-        prediction = decoded(self.decoder, self.decoder_start(z, c), start, features, training)
+        g = self.decoder_start(z, c)
+        prediction = decoded(self.decoder, g, start, features, scales, training)
         return VAEOutput(
             action_mean=action_mean.T,
             action_log_variance=action_log_variance.T,
@@ -152,6 +172,6 @@ class HVAE(nn.Module):
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`q(c | O)` with running averages: f32[B, S, T, D] -> (mean, log-variance) f32[B, dc]."""
-        h, _ = encoded(self.encoder, features, False)
+        h, _ = encoded(self.encoder, features, self.scales(features, False), False)
         mean, log_variance = self.action_inference(h, False)
         return mean.T, log_variance.T

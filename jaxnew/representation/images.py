@@ -21,7 +21,13 @@ from flax import linen as nn
 
 from jaxnew.convolution import WINDOW, convolution
 from jaxnew.representation.decoders import TrajectoryDecoder
-from jaxnew.representation.encoders import Dense, ResBlock, TrajectoryEncoder, uniform_within
+from jaxnew.representation.encoders import (
+    Dense,
+    ResBlock,
+    Scales,
+    TrajectoryEncoder,
+    uniform_within,
+)
 
 CODE_SHAPE = (3, 3, 32)  # Height, width and channels of the 288 numbers.
 CODE_SIZE = math.prod(CODE_SHAPE)
@@ -192,17 +198,20 @@ class ImageRecordingEncoder(nn.Module):
     Attributes:
       width: E.
       image_shape: (side, side, C).
+      reads_changes: see `RepresentationConfig`.
     """
 
     width: int
     image_shape: tuple[int, int, int]
+    reads_changes: bool = False
 
     @nn.compact
     def __call__(self, features: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
         """f32[B, S, T, side * side * C] -> (f32[E, B, S], first frames' codes f32[B, S, 288])."""
         codes = FrameEncoder()(features.reshape(-1, *self.image_shape), training)
         codes = codes.reshape(*features.shape[:-1], CODE_SIZE)
-        return TrajectoryEncoder(self.width, name="trajectory")(codes), codes[:, :, 0]
+        trajectory = TrajectoryEncoder(self.width, self.reads_changes, name="trajectory")
+        return trajectory(codes), codes[:, :, 0]
 
 
 class ImageRecordingDecoder(nn.Module):
@@ -212,12 +221,14 @@ class ImageRecordingDecoder(nn.Module):
       width: H.
       image_shape: (side, side, C).
       is_still: whether a recording is one image.
+      predicts_changes: see `RepresentationConfig`.
       pytorch_init: see `Dense`.
     """
 
     width: int
     image_shape: tuple[int, int, int]
     is_still: bool
+    predicts_changes: bool = False
     pytorch_init: bool = False
 
     @nn.compact
@@ -242,7 +253,9 @@ class ImageRecordingDecoder(nn.Module):
             codes = Dense(CODE_SIZE, self.pytorch_init)(hidden).reshape(CODE_SIZE, -1).T
             image, _ = decoder(codes, training)
             return image.reshape(*batch, 1, -1)
-        trajectory = TrajectoryDecoder(self.width, self.pytorch_init, name="trajectory")
+        trajectory = TrajectoryDecoder(
+            self.width, self.pytorch_init, self.predicts_changes, name="trajectory"
+        )
         codes = trajectory(g, first_codes, features.shape[2])
         first = features[:, :, 0].reshape(-1, *self.image_shape)
         means = []
@@ -252,38 +265,48 @@ class ImageRecordingDecoder(nn.Module):
         return jnp.stack(means, axis=2)
 
 
-def recording_encoder(width: int, image_shape: tuple[int, int, int] | None) -> nn.Module:
+def recording_encoder(
+    width: int, image_shape: tuple[int, int, int] | None, reads_changes: bool
+) -> nn.Module:
     """The encoder of trajectories, or of images of a shape; called by `encoded`."""
     if image_shape is None:
-        return TrajectoryEncoder(width)
-    return ImageRecordingEncoder(width, image_shape)
+        return TrajectoryEncoder(width, reads_changes)
+    return ImageRecordingEncoder(width, image_shape, reads_changes)
 
 
 def recording_decoder(
     width: int,
     image_shape: tuple[int, int, int] | None,
     is_still: bool,
+    predicts_changes: bool,
     pytorch_init: bool = False,
 ) -> nn.Module:
     """The decoder of trajectories, or of images of a shape; called by `decoded`."""
     if image_shape is None:
-        return TrajectoryDecoder(width, pytorch_init)
-    return ImageRecordingDecoder(width, image_shape, is_still, pytorch_init)
+        return TrajectoryDecoder(width, pytorch_init, predicts_changes)
+    return ImageRecordingDecoder(width, image_shape, is_still, predicts_changes, pytorch_init)
 
 
-def encoded(encoder: nn.Module, features: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
+def encoded(
+    encoder: nn.Module, features: jax.Array, scales: Scales, training: bool
+) -> tuple[jax.Array, jax.Array]:
     """Recordings f32[B, S, T, D] -> (f32[E, B, S], what the decoder starts from f32[B, S, D'])."""
     if isinstance(encoder, TrajectoryEncoder):
-        return encoder(features), features[:, :, 0]
+        return encoder(features, scales), features[:, :, 0]
     both: tuple[jax.Array, jax.Array] = encoder(features, training)
     return both
 
 
 def decoded(
-    decoder: nn.Module, g: jax.Array, start: jax.Array, features: jax.Array, training: bool
+    decoder: nn.Module,
+    g: jax.Array,
+    start: jax.Array,
+    features: jax.Array,
+    scales: Scales,
+    training: bool,
 ) -> jax.Array:
     """Means of the scored steps, from g f32[H, B, S] and what `encoded` gave to start from."""
     if isinstance(decoder, TrajectoryDecoder):
-        return decoder(g, start, features.shape[2])
+        return decoder(g, start, features.shape[2], scales)
     means: jax.Array = decoder(g, start, features, training)
     return means

@@ -75,7 +75,7 @@ class RepresentationLearner:
         # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
         self._optimizer = in_32_bits(
             optax.chain(
-                optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
+                optax.clip(config.gradient_clip), optax.radam(_learning_rate(config), threshold=5.0)
             )
         )
         self._run = jax.jit(self._run_steps)
@@ -331,7 +331,13 @@ class RepresentationLearner:
             training=True,
             mutable=["batch_stats"],
         )
-        terms = elbo_terms(output, features, self.modality.num_categories)
+        terms = elbo_terms(
+            output,
+            features,
+            self.modality.num_categories,
+            kl_recordings=self.config.kl_recordings,
+            has_shared_variance=self.modality.image_shape is not None,
+        )
         return weighted_loss(terms, weight), (terms, updated["batch_stats"])
 
     def _posterior_of(
@@ -342,6 +348,16 @@ class RepresentationLearner:
             variables, self._features(recordings), method="posterior"
         )
         return posterior
+
+
+def _learning_rate(config: RepresentationConfig) -> float | optax.Schedule:
+    """The learning rate, or that of each step."""
+    if not config.decays_learning_rate:
+        return config.learning_rate
+    half = config.num_steps // 2
+    return optax.linear_schedule(
+        config.learning_rate, config.learning_rate / 100, config.num_steps - half, half
+    )
 
 
 def _added(totals: Metrics, metrics: Metrics) -> Metrics:

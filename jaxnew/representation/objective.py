@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import struct
 
-# Bounds of the log-variance inside the Gaussian likelihood, and only there.
-LOG_VARIANCE_MIN, LOG_VARIANCE_MAX = -4.0, 3.0
+# Bound of the log-variance that fits the errors: a deviation of a 400th.
+OPTIMAL_LOG_VARIANCE_MIN = -12.0
 
 
 @struct.dataclass
@@ -22,7 +22,7 @@ class ElboTerms:
     Attributes:
       reconstruction: f32[] log-likelihood of the scored steps.
       kl_action: f32[] divergence of the action posteriors from N(0, I), each action counted once
-        (so 1/S per recording); zero for the flat VAE.
+        (so 1/S per recording, or 1/n, see `elbo_terms`); zero for the flat VAE.
       kl_observation: f32[] divergence of the recordings' posteriors from their prior.
     """
 
@@ -42,7 +42,8 @@ class VAEOutput:
         the flat VAE.
       prediction: f32[B, S, T-1, D] means or logits of the steps 1..T-1; f32[B, S, 1, D] of a still
         image.
-      likelihood_log_variance: f32[D], None for a categorical likelihood.
+      likelihood_log_variance: f32[D] that is learned; None for a categorical likelihood, and where
+        the variance is that of the batch's errors.
     """
 
     action_mean: jax.Array | None
@@ -60,18 +61,37 @@ def gaussian_log_likelihood(
 ) -> jax.Array:
     """Log-density of diagonal Gaussians, log(2 pi) included, summed over the last axis.
 
-    The log-variance is clamped to [-4, 3] here; outside, its gradient is zero.
+    Args:
+      target: f32[..., D].
+      mean: f32[..., D].
+      log_variance: f32[D] or f32[..., D], not clamped.
+    Returns:
+      f32[...].
+    """
+    squared_error = jnp.square(target - mean) * jnp.exp(-log_variance)
+    return -0.5 * jnp.sum(squared_error + log_variance + math.log(2.0 * math.pi), axis=-1)
+
+
+def optimal_log_variance(target: jax.Array, mean: jax.Array, is_shared: bool) -> jax.Array:
+    """The log-variance under which a batch is likeliest given its means: its mean squared error.
+
+    The optimal sigma-VAE (Rybkin, Daniilidis, Levine, "Simple and Effective VAE Training with
+    Calibrated Decoders", ICML 2021, section 4.2). No gradient flows through it: it would be zero.
+    At least -12.
 
     Args:
       target: f32[..., D].
       mean: f32[..., D].
-      log_variance: f32[D] or f32[..., D].
+      is_shared: one for all D numbers, as for pixels; False: one for each.
     Returns:
-      f32[...].
+      f32[D].
     """
-    log_variance = jnp.clip(log_variance, LOG_VARIANCE_MIN, LOG_VARIANCE_MAX)
-    squared_error = jnp.square(target - mean) * jnp.exp(-log_variance)
-    return -0.5 * jnp.sum(squared_error + log_variance + math.log(2.0 * math.pi), axis=-1)
+    squared_error = jnp.square(target - mean).reshape(-1, target.shape[-1])
+    variance = jnp.mean(squared_error, axis=0)
+    if is_shared:
+        variance = jnp.full_like(variance, jnp.mean(variance))
+    variance = jnp.maximum(variance, math.exp(OPTIMAL_LOG_VARIANCE_MIN))
+    return jax.lax.stop_gradient(jnp.log(variance))
 
 
 def categorical_log_likelihood(
@@ -153,20 +173,31 @@ def weighted_loss(terms: ElboTerms, weight: jax.Array | float) -> jax.Array:
     return (terms.kl_action + terms.kl_observation) / weight - weight * terms.reconstruction
 
 
-def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> ElboTerms:
+def elbo_terms(
+    output: VAEOutput,
+    features: jax.Array,
+    num_categories: int,
+    *,
+    kl_recordings: int | None = None,
+    has_shared_variance: bool = False,
+) -> ElboTerms:
     """The terms of the bound for one batch.
 
     Args:
       output: of the model's forward pass on `features`.
       features: f32[B, S, T, D]; step 0 is given to the decoder and not scored, unless T = 1, which
         is a still image.
-      num_categories: categories per coordinate; not read for a Gaussian likelihood.
+      num_categories: categories per coordinate; 0 for a Gaussian likelihood.
+      kl_recordings: n, the action's divergence counts 1/n per recording; None: 1/S.
+      has_shared_variance: see `optimal_log_variance`.
     """
     target = features[:, :, 1:] if features.shape[2] > 1 else features
     log_variance = output.likelihood_log_variance
-    if log_variance is None:
+    if num_categories:
         log_likelihood = categorical_log_likelihood(target, output.prediction, num_categories)
     else:
+        if log_variance is None:
+            log_variance = optimal_log_variance(target, output.prediction, has_shared_variance)
         log_likelihood = gaussian_log_likelihood(target, output.prediction, log_variance)
     kl_observation = gaussian_kl(
         output.observation_mean,
@@ -177,9 +208,10 @@ def elbo_terms(output: VAEOutput, features: jax.Array, num_categories: int) -> E
     kl_action = jnp.zeros((), jnp.float32)
     if output.action_mean is not None and output.action_log_variance is not None:
         kl_action = jnp.sum(gaussian_kl(output.action_mean, output.action_log_variance))
-    num_recordings = features.shape[0] * features.shape[1]
+    num_actions, per_action = features.shape[:2]
+    num_recordings = num_actions * per_action
     return ElboTerms(
         reconstruction=jnp.sum(log_likelihood) / num_recordings,
-        kl_action=kl_action / num_recordings,
+        kl_action=kl_action / (num_actions * (kl_recordings or per_action)),
         kl_observation=jnp.sum(kl_observation) / num_recordings,
     )

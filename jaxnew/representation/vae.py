@@ -16,6 +16,7 @@ from jaxnew.representation.decoders import DecoderStart
 from jaxnew.representation.encoders import (
     Dense,
     LatentHead,
+    Standardization,
     likelihood_log_variance,
 )
 from jaxnew.representation.hvae import HVAE
@@ -56,7 +57,8 @@ class FlatVAE(nn.Module):
       encoder_width: E.
       hidden_width: H.
       observation_latent: dz.
-      gaussian_dim, image_shape, is_still: see `HVAE`.
+      gaussian_dim, image_shape, is_still, standardizes, predicts_changes, reads_changes: see
+        `HVAE`.
     """
 
     encoder_width: int
@@ -65,13 +67,21 @@ class FlatVAE(nn.Module):
     gaussian_dim: int
     image_shape: tuple[int, int, int] | None = None
     is_still: bool = False
+    standardizes: bool = False
+    predicts_changes: bool = False
+    reads_changes: bool = False
 
     def setup(self) -> None:
-        self.encoder = recording_encoder(self.encoder_width, self.image_shape)
+        self.encoder = recording_encoder(self.encoder_width, self.image_shape, self.reads_changes)
+        self.scales = Standardization(self.standardizes and self.image_shape is None)
         self.inference = FlatInference(self.hidden_width, self.observation_latent)
         self.decoder_start = DecoderStart(self.hidden_width, pytorch_init=True)
         self.decoder = recording_decoder(
-            self.hidden_width, self.image_shape, self.is_still, pytorch_init=True
+            self.hidden_width,
+            self.image_shape,
+            self.is_still,
+            self.predicts_changes,
+            pytorch_init=True,
         )
         self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
 
@@ -83,12 +93,13 @@ class FlatVAE(nn.Module):
           noise: of the sampled latents.
           training: True normalises with batch statistics and updates the running averages.
         """
-        h, start = encoded(self.encoder, features, training)
+        scales = self.scales(features, training)
+        h, start = encoded(self.encoder, features, scales, training)
         mean, log_variance = self.inference(h, training)
         z_noise = jnp.moveaxis(noise.observation, -1, 0)
         z = sample_gaussian(mean, log_variance[:, None, None], z_noise)
         g = self.decoder_start(z, None)
-        prediction = decoded(self.decoder, g, start, features, training)
+        prediction = decoded(self.decoder, g, start, features, scales, training)
         return VAEOutput(
             action_mean=None,
             action_log_variance=None,
@@ -109,7 +120,8 @@ class FlatVAE(nn.Module):
           f32[B, dz] mean over S of the recordings' posterior means, and their shared
           log-variance, f32[B, dz].
         """
-        mean, log_variance = self.inference(encoded(self.encoder, features, False)[0], False)
+        h, _ = encoded(self.encoder, features, self.scales(features, False), False)
+        mean, log_variance = self.inference(h, False)
         mean = jnp.mean(mean, axis=-1).T
         return mean, jnp.broadcast_to(log_variance, mean.shape)
 
@@ -120,12 +132,18 @@ def build_model(config: RepresentationConfig, modality: Modality) -> HVAE | Flat
         "encoder_width": config.encoder_width,
         "hidden_width": config.hidden_width,
         "observation_latent": config.observation_latent,
-        "gaussian_dim": modality.gaussian_dim,
+        "gaussian_dim": 0 if config.has_optimal_variance else modality.gaussian_dim,
         "image_shape": modality.image_shape,
         "is_still": modality.is_still,
+        "standardizes": config.standardizes,
+        "predicts_changes": config.predicts_changes,
+        "reads_changes": config.reads_changes,
     }
     if config.kind == "vae":
         return FlatVAE(**shared)
     return HVAE(
-        inference_width=config.inference_width, action_latent=config.action_latent, **shared
+        inference_width=config.inference_width,
+        action_latent=config.action_latent,
+        normalizes_log_variance=config.normalizes_log_variance,
+        **shared,
     )

@@ -245,7 +245,8 @@ def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
     if "members" in recorded:
         return {"members": [upgraded(member) for member in recorded["members"]]}
     if "ppo" not in recorded:
-        return {**recorded, "split_seed": recorded.get("split_seed", 0)}
+        model = {**config_lib.plain(RepresentationConfig()), **recorded.get("model", {})}
+        return {"split_seed": 0, **recorded, "model": model}
     added = {"split_seed": 0, "num_clusters": 0, "conditions_position": False}
     new: dict[str, Any] = {**added, "environment_version": 0, "environment": [], **recorded}
     rollout = dict(new["ppo"]["rollout"])

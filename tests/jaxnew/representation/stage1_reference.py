@@ -102,20 +102,44 @@ def action_statistics(p, h):
     return np.array(rows)
 
 
-def decode(p, g, first_step, num_steps):
+def scales_of(x):
+    """Mean, deviation and root mean square change of each of the D numbers of x [B, S, T, D]."""
+    changes = (x[:, :, 1:] - x[:, :, :-1]).reshape(-1, x.shape[-1])
+    x = x.reshape(-1, x.shape[-1])
+    return x.mean(0), np.sqrt(x.var(0) + 1e-6), np.sqrt((changes**2).mean(0) + 1e-6)
+
+
+def reading(x, scales, reads_changes):
+    """What the encoder reads of x [T, D]."""
+    mean, deviation, change = scales
+    rows = []
+    for t, step in enumerate(x):
+        row = [(step - mean) / deviation]
+        if reads_changes:
+            row.append((step - x[max(t - 1, 0)]) / change)
+        rows.append(np.concatenate(row))
+    return np.array(rows)
+
+
+def decode(p, g, first_step, num_steps, scales=(0.0, 1.0, 1.0), predicts_changes=False):
     """g [H], first_step [D] of one recording -> [T-1, D]."""
+    mean, deviation, change = scales
     state = np.zeros(g.shape), np.zeros(g.shape)
     step, out = first_step, []
     for _ in range(num_steps - 1):
-        u = res_block(p["before_lstm"], dense(p["read"], step))
+        u = res_block(p["before_lstm"], dense(p["read"], (step - mean) / deviation))
         state = lstm_step(p["lstm"], g * u, *state)
-        step = dense(p["write"], res_block(p["after_lstm"], state[0]))
+        written = dense(p["write"], res_block(p["after_lstm"], state[0]))
+        step = step + change * written if predicts_changes else mean + deviation * written
         out.append(step)
     return np.array(out)
 
 
+def learned_log_variance(p):
+    return np.clip(p["likelihood_log_variance"], -4.0, 3.0)
+
+
 def gaussian_log_density(x, mean, log_variance):
-    log_variance = np.clip(log_variance, -4.0, 3.0)
     return np.sum(
         -0.5 * np.log(2 * np.pi) - 0.5 * log_variance - (x - mean) ** 2 / (2 * np.exp(log_variance))
     )
@@ -139,15 +163,29 @@ def gaussian_kl(mean, log_variance, prior_mean, prior_log_variance):
     )
 
 
-def hvae(p, x, action_noise, observation_noise, num_categories=0):
-    """One training pass: (reconstruction, kl_action, kl_observation), each divided by B*S."""
+def hvae(p, x, action_noise, observation_noise, num_categories=0, is_changed=False):
+    """One training pass: (reconstruction, kl_action, kl_observation), each divided by B*S.
+
+    `is_changed`: with all that jaxnew adds to the paper's, but for the weight of `kl_action`.
+    """
     p, x = as_float64(p), np.asarray(x, np.float64)
-    num_actions, num_recordings, num_steps, _ = x.shape
-    h = np.array([[encode_recording(p["encoder"], one) for one in rows] for rows in x])
+    num_actions, num_recordings, num_steps, dim = x.shape
+    scales = scales_of(x) if is_changed else (0.0, 1.0, 1.0)
+    h = np.array(
+        [
+            [encode_recording(p["encoder"], reading(one, scales, is_changed)) for one in rows]
+            for rows in x
+        ]
+    )
 
     q = p["action_inference"]
-    statistics = scalar_batch_norm(q["ScalarBatchNorm_0"], action_statistics(q, h))
-    mean, log_variance = np.split(statistics, 2, axis=1)
+    statistics = action_statistics(q, h)
+    if is_changed:
+        mean, log_variance = np.split(statistics, 2, axis=1)
+        mean = scalar_batch_norm(q["ScalarBatchNorm_0"], mean)
+    else:
+        statistics = scalar_batch_norm(q["ScalarBatchNorm_0"], statistics)
+        mean, log_variance = np.split(statistics, 2, axis=1)
     c = mean + np.exp(log_variance / 2) * action_noise
 
     q = p["observation_inference"]
@@ -162,21 +200,24 @@ def hvae(p, x, action_noise, observation_noise, num_categories=0):
     prior_mean = scalar_batch_norm(prior_head["ScalarBatchNorm_0"], latent_mean(prior_head, e))
 
     q = p["decoder_start"]
+    predicted = np.zeros((num_actions, num_recordings, num_steps - 1, dim))
+    for b, s in np.ndindex(num_actions, num_recordings):
+        g = relu(dense(q["from_observation"], z[b, s]) + dense(q["from_action"], c[b]))
+        predicted[b, s] = decode(p["decoder"], g, x[b, s, 0], num_steps, scales, is_changed)
+    if is_changed:
+        likelihood = np.log(((x[:, :, 1:] - predicted) ** 2).reshape(-1, dim).mean(axis=0))
+    elif not num_categories:
+        likelihood = learned_log_variance(p)
+
     reconstruction = kl_action = kl_observation = 0.0
     for b in range(num_actions):
         kl_action += gaussian_kl(mean[b], log_variance[b], 0.0, 0.0)
         for s in range(num_recordings):
-            g = relu(dense(q["from_observation"], z[b, s]) + dense(q["from_action"], c[b]))
-            predicted = decode(p["decoder"], g, x[b, s, 0], num_steps)
-            for t in range(1, num_steps):
+            for step, means in zip(x[b, s, 1:], predicted[b, s], strict=True):
                 if num_categories:
-                    reconstruction += one_hot_log_likelihood(
-                        x[b, s, t], predicted[t - 1], num_categories
-                    )
+                    reconstruction += one_hot_log_likelihood(step, means, num_categories)
                 else:
-                    reconstruction += gaussian_log_density(
-                        x[b, s, t], predicted[t - 1], p["likelihood_log_variance"]
-                    )
+                    reconstruction += gaussian_log_density(step, means, likelihood)
             kl_observation += gaussian_kl(
                 z_mean[b, s], z_head["log_variance"], prior_mean[b], prior_head["log_variance"]
             )
@@ -198,7 +239,7 @@ def flat_vae(p, x, observation_noise):
         predicted = decode(p["decoder"], g, x[b, s, 0], x.shape[2])
         for t in range(1, x.shape[2]):
             reconstruction += gaussian_log_density(
-                x[b, s, t], predicted[t - 1], p["likelihood_log_variance"]
+                x[b, s, t], predicted[t - 1], learned_log_variance(p)
             )
         kl += gaussian_kl(mean[b, s], head["log_variance"], 0.0, 0.0)
     count = x.shape[0] * x.shape[1]

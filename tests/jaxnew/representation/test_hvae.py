@@ -1,6 +1,7 @@
 """The networks against plain NumPy, their initial distributions, and their sizes."""
 
 import functools
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -171,6 +172,52 @@ def test_the_whole_hvae_equals_numpy(num_categories):
     )
     ours = (terms.reconstruction, terms.kl_action, terms.kl_observation)
     np.testing.assert_allclose(ours, expected, rtol=2e-3)  # A chain of ~40 float32 layers.
+
+
+@pytest.mark.oracle
+def test_the_whole_hvae_of_changes_equals_numpy():
+    """All that is not the paper's at once: units, changes, variances, the weight of the KL."""
+    features = np.random.default_rng(15).uniform(0, 9, (3, 4, 4, 2)).astype(np.float32)
+    features[..., 1] *= 0.01  # In another unit.
+    model = replace(
+        small_hvae(0),
+        normalizes_log_variance=False,
+        standardizes=True,
+        predicts_changes=True,
+        reads_changes=True,
+    )
+    draws = noise(16, 3, 4)
+    variables = random_variables(model, features, draws, False)
+    output, updated = apply_in_training(model, variables, features, draws)
+    terms = objective.elbo_terms(output, features, 0, kl_recordings=672)
+    reconstruction, kl_action, kl_observation = reference.hvae(
+        variables["params"], features, draws.action, draws.observation, is_changed=True
+    )
+    ours = (terms.reconstruction, terms.kl_action, terms.kl_observation)
+    expected = (reconstruction, kl_action * 4 / 672, kl_observation)
+    np.testing.assert_allclose(ours, expected, rtol=2e-3)
+    mean, deviation, change = reference.scales_of(features.astype(np.float64))
+    found = (mean, deviation**2 - 1e-6, change**2 - 1e-6)
+    for name, value in zip(("mean", "variance", "squared_change"), found, strict=True):
+        before, after = (v["batch_stats"]["scales"][name] for v in (variables, updated))
+        np.testing.assert_allclose(after, 0.99 * before + 0.01 * value, rtol=1e-4)
+
+
+@pytest.mark.unit
+def test_learned_log_variances_beyond_their_bounds_get_no_gradient():
+    features = np.random.default_rng(17).uniform(0, 9, (2, 3, 3, 2)).astype(np.float32)
+    model, draws = small_hvae(2), noise(18, 2, 3)
+    variables = random_variables(model, features, draws, False)
+
+    def loss(log_variance):
+        params = {**variables["params"], "likelihood_log_variance": log_variance}
+        output, _ = apply_in_training(model, {**variables, "params": params}, features, draws)
+        return objective.elbo_terms(output, features, 0).reconstruction
+
+    for value, has_gradient in ((-4.5, False), (1.0, True), (3.5, False)):
+        gradient = jax.grad(loss)(jnp.full(2, value))
+        assert np.all((gradient != 0.0) == has_gradient)
+    np.testing.assert_array_equal(loss(jnp.full(2, -9.0)), loss(jnp.full(2, -4.0)))
 
 
 @pytest.mark.oracle

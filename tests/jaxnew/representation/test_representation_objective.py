@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy.optimize
 import scipy.special
 import scipy.stats
 
@@ -13,25 +14,48 @@ from jaxnew.representation import objective
 
 
 @pytest.mark.oracle
-def test_gaussian_log_likelihood_is_scipys_with_the_variance_clamped():
+def test_gaussian_log_likelihood_is_scipys():
     rng = np.random.default_rng(0)
     target, mean = rng.normal(size=(2, 7, 3))
-    log_variance = np.array([-9.0, 0.5, 8.0])  # The ends lie outside [-4, 3].
-    std = np.exp(np.array([-4.0, 0.5, 3.0]) / 2)
+    log_variance = np.array([-9.0, 0.5, 8.0])
     ours = objective.gaussian_log_likelihood(target, mean, log_variance)
-    expected = scipy.stats.norm.logpdf(target, mean, std).sum(axis=1)
+    expected = scipy.stats.norm.logpdf(target, mean, np.exp(log_variance / 2)).sum(axis=1)
     np.testing.assert_allclose(ours, expected, rtol=1e-5)  # float32 sums of a few terms.
 
 
-@pytest.mark.unit
-def test_clamped_log_variances_get_no_gradient():
-    def loss(log_variance):
-        return objective.gaussian_log_likelihood(jnp.ones(3), jnp.zeros(3), log_variance)
+@pytest.mark.oracle
+@pytest.mark.parametrize("is_shared", [False, True])
+def test_the_optimal_variance_is_the_likeliest(is_shared):
+    """SciPy searches for it; a number without errors has the least variance."""
+    rng = np.random.default_rng(1)
+    target, mean = rng.normal(size=(2, 2, 4, 3)) * [1.0, 20.0, 1.0]
+    target[..., 2] = mean[..., 2]
+    found = np.asarray(objective.optimal_log_variance(target, mean, is_shared))
+    parts = [slice(None)] if is_shared else [0, 1]
+    for part in parts:
 
-    gradient = jax.grad(loss)(jnp.array([-4.5, 1.0, 3.5]))
-    assert gradient[0] == 0.0
-    assert gradient[1] != 0.0
-    assert gradient[2] == 0.0
+        def cost(log_variance, part=part):
+            std = np.exp(log_variance / 2)
+            return -scipy.stats.norm.logpdf(target[..., part], mean[..., part], std).sum()
+
+        expected = scipy.optimize.minimize_scalar(cost, bounds=(-15.0, 15.0), method="bounded").x
+        np.testing.assert_allclose(found[part], expected, atol=1e-4)
+    if not is_shared:
+        assert found[2] == -12.0
+
+
+@pytest.mark.unit
+def test_no_gradient_flows_through_the_optimal_variance():
+    target = jnp.array([[1.0, 2.0], [3.0, 4.0]])
+
+    def loss(mean, log_variance=None):
+        if log_variance is None:
+            log_variance = objective.optimal_log_variance(target, mean, False)
+        return objective.gaussian_log_likelihood(target, mean, log_variance).sum()
+
+    mean = jnp.zeros_like(target)
+    fixed = objective.optimal_log_variance(target, mean, False)
+    np.testing.assert_array_equal(jax.grad(loss)(mean), jax.grad(loss)(mean, fixed))
 
 
 @pytest.mark.oracle

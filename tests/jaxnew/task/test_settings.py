@@ -421,6 +421,8 @@ def test_configs_of_encoders_are_read() -> None:
     recorded = identity(EMBED)
     del recorded["split_seed"]
     assert upgraded(recorded) == identity(EMBED)
+    of_0_3_0 = dict(list(recorded["model"].items())[:11])  # All that it had, the paper's settings.
+    assert upgraded({**recorded, "model": of_0_3_0}) == identity(EMBED)
     assert upgraded(identity(replace(EMBED, split_seed=4)))["split_seed"] == 4
     with pytest.raises(ConfigError, match="no run of a policy: its config has no ppo and task"):
         read_train_config(recorded)
