@@ -300,14 +300,13 @@ def learned(is_conditioned: bool) -> dict[str, float]:
     learner = Learner(rollout, config)
     actions = Actions.of(VECTORS, np.arange(48, dtype=np.int32), SIZE)
     state = learner.compiled_init(jax.random.key(0), actions)
-    state, _ = learner.compiled_updates(state, numbers, actions, num_updates=120)
+    state, _ = learner.compiled_updates(state, numbers, actions, num_updates=60)
     new = Actions.of(VECTORS, np.arange(48, NUM, dtype=np.int32), SIZE)
     episodes = measure(rollout, state.policy, new, 512, seed=9, is_greedy=True)
     return {name: float(values.mean()) for name, values in episodes.items()}
 
 
 @pytest.mark.learning
-@pytest.mark.optimized
 def test_a_place_that_depends_on_the_choice_needs_the_conditioned_head() -> None:
     """Half of the episodes ask for a stop, and both heads learn it. In the others every action
     belongs elsewhere: one place for all is at best near one of a set's few good actions."""

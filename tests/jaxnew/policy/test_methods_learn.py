@@ -22,7 +22,7 @@ from jaxnew.rollout.device import DeviceRollout
 from jaxnew.sampling import Actions
 from tests import probe_environments as probe
 
-pytestmark = [pytest.mark.learning, pytest.mark.optimized]
+pytestmark = pytest.mark.learning
 
 A, M, D, S = 256, 8, 4, 2
 TRAIN, HELD_OUT = np.arange(128, dtype=np.int32), np.arange(128, 256, dtype=np.int32)

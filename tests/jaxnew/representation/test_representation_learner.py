@@ -236,14 +236,18 @@ def test_first_epoch_weighs_reconstruction_twice_and_the_third_by_a_quarter_more
 
 
 @pytest.mark.oracle
-def test_optimiser_is_elementwise_clamp_then_radam_with_its_unrectified_phase():
+@pytest.mark.parametrize("is_decaying", [False, True])
+def test_optimiser_is_elementwise_clamp_then_radam_with_its_unrectified_phase(is_decaying):
     # rho_t exceeds 5 from t = 6 on, so both phases are run; gradients beyond 0.5 are clamped.
     gradients = [0.3, -0.9, 4.0, 0.1, -0.2, 0.45, -7.0, 0.05, 0.5, 0.2] * 4
-    optimizer = learner.RepresentationLearner(TINY, XY)._optimizer
+    config = dataclasses.replace(TINY, num_steps=40, decays_learning_rate=is_decaying)
+    optimizer = learner.RepresentationLearner(config, XY)._optimizer
     params = jnp.zeros(2)
     opt_state = optimizer.init(params)
     update_of = jax.jit(optimizer.update)
-    expected = reference.radam(np.clip(gradients, -0.5, 0.5))
+    expected = np.array(reference.radam(np.clip(gradients, -0.5, 0.5)))
+    if is_decaying:
+        expected[20:] *= 1.0 - 0.99 * np.arange(20) / 20
     assert abs(expected[0]) == pytest.approx(1e-3 * 0.3)  # No adaptation: lr times momentum.
     for t, (gradient, update) in enumerate(zip(gradients, expected, strict=True), start=1):
         updates, opt_state = update_of(jnp.array([gradient, 0.0]), opt_state, params)
@@ -362,6 +366,8 @@ def test_bad_modalities_are_refused(changes, message):
         ({"num_steps": 2.5}, TypeError, "num_steps=2.5"),
         ({"learning_rate": float("nan")}, ValueError, "learning_rate=nan"),
         ({"gradient_clip": -1.0}, ValueError, "gradient_clip=-1.0"),
+        ({"kl_recordings": 0}, ValueError, "kl_recordings=0 must be positive"),
+        ({"kl_recordings": 0.5}, TypeError, "kl_recordings=0.5 must be an integer"),
     ],
 )
 def test_bad_configs_are_refused(changes, error, message):
