@@ -26,14 +26,12 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
-# Relative coordinates: raw ones take hours of training to tell skills apart (docs/gotchas.md).
-_REPRESENTATION = "hvae-relative"
 
 
 def main() -> int | None:
     start = time.perf_counter()
     task, budget = load_task("grid_world"), ARGUMENTS.budget
-    encoder = embed(task, _REPRESENTATION, budget=budget, runs=ARGUMENTS.runs)
+    encoder = embed(task, budget=budget, runs=ARGUMENTS.runs)
     run = train(
         task,
         encoder.table,

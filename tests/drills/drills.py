@@ -36,7 +36,7 @@ from tests.experiments.create_runs import saved, timeless
 JOBS: Mapping[str, str] = {
     "train": "train --representation=gt12 --budget=smoke",
     "train on the host": "train --task=tests.toy_task:TASK --representation=gt4 --budget=smoke",
-    "collect and embed": "embed --representation=hvae-relative --budget=smoke",
+    "collect and embed": "embed --representation=hvae --budget=smoke",
     "sweep": "sweep --representation=gt12 --budget=smoke --seeds=1,2",
 }
 # Files of a run that say how it was made, and which nothing that is computed depends on.

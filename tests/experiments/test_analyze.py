@@ -22,8 +22,8 @@ from jaxnew.task.places import UsageError
 from tests.experiments.commands import evaluation, run, run_alone
 from tests.experiments.several import run_several
 
-POLICY = "ours-hvae-relative-default-smoke-31"
-ENCODER = "embed-hvae-relative-default-smoke-31"
+POLICY = "ours-hvae-default-smoke-31"
+ENCODER = "embed-hvae-default-smoke-31"
 STUDIED = {
     "set-size": "10,50",
     "unseen-ratio": "0,1",
@@ -36,7 +36,7 @@ STUDIED = {
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An encoder and a policy on its table, at smoke budget."""
     folder = tmp_path_factory.mktemp("runs")
-    run("train", "--representation=hvae-relative", "--budget=smoke", f"--runs={folder}")
+    run("train", "--representation=hvae", "--budget=smoke", f"--runs={folder}")
     return folder / "grid_world"
 
 

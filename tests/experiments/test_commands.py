@@ -49,12 +49,12 @@ def hvae_run(runs: Path) -> Path:
     for command in commands:
         smaller = command.replace("laptop", "smoke").replace("every=50", "every=2")
         run(*smaller.split(), f"--runs={runs}")
-    return runs / "grid_world" / "ours-hvae-relative-default-smoke-31"
+    return runs / "grid_world" / "ours-hvae-default-smoke-31"
 
 
 @pytest.fixture(scope="module")
 def encoder_run(hvae_run: Path) -> Path:
-    return hvae_run.parent / "embed-hvae-relative-default-smoke-31"
+    return hvae_run.parent / "embed-hvae-default-smoke-31"
 
 
 def test_a_run_directory_explains_itself(hvae_run: Path, encoder_run: Path) -> None:
@@ -117,7 +117,7 @@ def test_evaluate_on_a_checkpoint_ids_a_mixture_and_greedily(
 def page(hvae_run: Path, runs: Path) -> list[list[str]]:
     """Commands of the page on new actions, with the encoder and the run of these tests."""
     assert hvae_run
-    names = ("embed-hvae-relative-default-{}-31", "ours-hvae-relative-default-{}-31")
+    names = ("embed-hvae-default-{}-31", "ours-hvae-default-{}-31")
     folder = runs / "grid_world"
     paths = {
         f"runs/grid_world/{name.format('laptop')}": folder / name.format("smoke") for name in names
@@ -182,7 +182,7 @@ def test_new_actions_that_are_mistaken_are_refused(
 
 def test_train_again_finds_the_run_complete(hvae_run: Path, runs: Path) -> None:
     before = (hvae_run / "metrics.jsonl").read_bytes()
-    output = run("train", "--budget=smoke", "--representation=hvae-relative", f"--runs={runs}")
+    output = run("train", "--budget=smoke", "--representation=hvae", f"--runs={runs}")
     assert "already complete" in output
     assert (hvae_run / "metrics.jsonl").read_bytes() == before
 
@@ -192,7 +192,7 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
     output = run(
         "train",
         "--budget=smoke",
-        "--representation=hvae-relative",
+        "--representation=hvae",
         f"--runs={runs}",
         "--set=hyperparameters.clip=0.2",
         fails=True,
@@ -205,9 +205,9 @@ def test_another_config_is_refused_and_named(hvae_run: Path, runs: Path) -> None
 
 
 def test_an_embed_report_and_other_representations(encoder_run: Path, runs: Path) -> None:
-    """Of a run that is complete, and of two that are made; for `hvae` see below."""
+    """Of a run that is complete, and of two that are made."""
     common = ("--budget=smoke", f"--runs={runs}")
-    names = ("hvae-relative", "hvae-onehot-oracle", "vae")
+    names = ("hvae", "hvae-onehot-oracle", "vae-relative")
     jobs = [(*common, f"--representation={name}") for name in names]
     outputs = [run("embed", *job) for job in jobs]
     assert "already complete" in outputs[0]
