@@ -42,7 +42,7 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
     ),
     "split": ("string", None, "Name of the split; default: the task's first."),
     "split_seed": ("integer", 0, "Seed of the split, where it can be drawn anew."),
-    "budget": ("string", "laptop", "smoke, laptop, paper (stage one also: fast)."),
+    "budget": ("string", "laptop", "smoke, laptop or paper; some tasks have more."),
     "seed": ("integer", 31, "Seed of the run."),
     "workdir": ("string", None, "Directory of the run; default: below --runs."),
     "runs": ("string", "runs", "Where runs and what they share are kept."),
