@@ -36,7 +36,8 @@ class RepresentationConfig:
       kl_recordings: n, the action's divergence counts 1/n per recording, as if each action had n
         recordings in the batch; None: as many as it has (HVAE only).
       standardizes: encoder and decoder read and write vectors in units of their mean, deviation and
-        step size, see `encoders.Scales`; False: as they are.
+        step size, see `encoders.Scales`, and the decoder's images start as their mean colour;
+        False: as they are.
       predicts_changes: the decoder adds what it gives to the last step; False: it gives the step.
       reads_changes: the encoder reads how far each step is from the one before, too.
 

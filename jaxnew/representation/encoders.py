@@ -137,15 +137,20 @@ class Standardization(nn.Module):
 
     Attributes:
       is_active: False gives `AS_GIVEN`.
+      num_channels: C, where the D numbers are pixels of as many channels; scales are then of the
+        channels, f32[C], and `change` is that from pixel to pixel, which nobody reads.
     """
 
     is_active: bool
+    num_channels: int | None = None
 
     @nn.compact
     def __call__(self, features: jax.Array, training: bool) -> Scales:
-        """f32[B, S, T, D], T at least 2 -> scales."""
+        """f32[B, S, T, D] -> scales; T at least 2, but for images."""
         if not self.is_active:
             return AS_GIVEN
+        if self.num_channels is not None:
+            features = features.reshape(-1, self.num_channels)
         shape = features.shape[-1:]
         mean = self.variable("batch_stats", "mean", jnp.zeros, shape)
         variance = self.variable("batch_stats", "variance", jnp.ones, shape)

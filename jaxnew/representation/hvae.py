@@ -127,7 +127,8 @@ class HVAE(nn.Module):
 
     def setup(self) -> None:
         self.encoder = recording_encoder(self.encoder_width, self.image_shape, self.reads_changes)
-        self.scales = Standardization(self.standardizes and self.image_shape is None)
+        num_channels = None if self.image_shape is None else self.image_shape[-1]
+        self.scales = Standardization(self.standardizes, num_channels)
         self.action_inference = ActionInference(
             self.inference_width, self.action_latent, self.normalizes_log_variance
         )

@@ -177,8 +177,13 @@ class FrameDecoder(nn.Module):
     image_shape: tuple[int, int, int]
 
     @nn.compact
-    def __call__(self, codes: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
-        """f32[n, 288] -> (image f32[n, side, side, C] in +-0.5, mask f32[n, side, side, 1])."""
+    def __call__(
+        self, codes: jax.Array, mean: jax.Array | float, training: bool
+    ) -> tuple[jax.Array, jax.Array]:
+        """(codes f32[n, 288], mean f32[C]) -> (f32[n, side, side, C], mask f32[n, side, side, 1]).
+
+        Images are in +-0.5. Where the network gives 0, they have the given mean.
+        """
         x = codes.reshape(-1, *CODE_SHAPE)
         for layer in DECODERS[self.image_shape[0]]:
             if isinstance(layer, int):
@@ -188,8 +193,14 @@ class FrameDecoder(nn.Module):
             x = nn.relu(ChannelBatchNorm()(x, training))
         init = uniform_within(1.0 / math.sqrt(x.shape[-1]))
         out = nn.Dense(self.image_shape[2] + 1, kernel_init=init, bias_init=init, name="pixels")(x)
-        out = nn.sigmoid(out)
-        return out[..., :-1] - 0.5, out[..., -1:]
+        image = nn.sigmoid(out[..., :-1] + _logit(mean))
+        return image - 0.5, nn.sigmoid(out[..., -1:])
+
+
+def _logit(mean: jax.Array | float) -> jax.Array:
+    """What a sigmoid makes `mean + 0.5` of, where that is neither 0 nor 1: at least 0.01 apart."""
+    share = jnp.clip(mean + 0.5, 0.01, 0.99)
+    return jnp.log(share) - jnp.log1p(-share)
 
 
 class ImageRecordingEncoder(nn.Module):
@@ -233,7 +244,12 @@ class ImageRecordingDecoder(nn.Module):
 
     @nn.compact
     def __call__(
-        self, g: jax.Array, first_codes: jax.Array, features: jax.Array, training: bool
+        self,
+        g: jax.Array,
+        first_codes: jax.Array,
+        features: jax.Array,
+        scales: Scales,
+        training: bool,
     ) -> jax.Array:
         """Decodes.
 
@@ -241,6 +257,7 @@ class ImageRecordingDecoder(nn.Module):
           g: f32[H, B, S] from `DecoderStart`.
           first_codes: f32[B, S, 288] of the first frames; not read for still images.
           features: f32[B, S, T, side * side * C] recordings; a video's first frame is read.
+          scales: of the C channels; their means are read.
           training: see `ChannelBatchNorm`.
 
         Returns:
@@ -251,7 +268,7 @@ class ImageRecordingDecoder(nn.Module):
         if self.is_still:
             hidden = ResBlock(2, self.pytorch_init)(g)
             codes = Dense(CODE_SIZE, self.pytorch_init)(hidden).reshape(CODE_SIZE, -1).T
-            image, _ = decoder(codes, training)
+            image, _ = decoder(codes, scales.mean, training)
             return image.reshape(*batch, 1, -1)
         trajectory = TrajectoryDecoder(
             self.width, self.pytorch_init, self.predicts_changes, name="trajectory"
@@ -260,7 +277,7 @@ class ImageRecordingDecoder(nn.Module):
         first = features[:, :, 0].reshape(-1, *self.image_shape)
         means = []
         for t in range(features.shape[2] - 1):
-            image, mask = decoder(codes[:, :, t].reshape(-1, CODE_SIZE), training)
+            image, mask = decoder(codes[:, :, t].reshape(-1, CODE_SIZE), scales.mean, training)
             means.append((mask * image + (1.0 - mask) * first).reshape(*batch, -1))
         return jnp.stack(means, axis=2)
 
@@ -308,5 +325,5 @@ def decoded(
     """Means of the scored steps, from g f32[H, B, S] and what `encoded` gave to start from."""
     if isinstance(decoder, TrajectoryDecoder):
         return decoder(g, start, features.shape[2], scales)
-    means: jax.Array = decoder(g, start, features, training)
+    means: jax.Array = decoder(g, start, features, scales, training)
     return means

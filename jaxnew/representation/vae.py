@@ -73,7 +73,8 @@ class FlatVAE(nn.Module):
 
     def setup(self) -> None:
         self.encoder = recording_encoder(self.encoder_width, self.image_shape, self.reads_changes)
-        self.scales = Standardization(self.standardizes and self.image_shape is None)
+        num_channels = None if self.image_shape is None else self.image_shape[-1]
+        self.scales = Standardization(self.standardizes, num_channels)
         self.inference = FlatInference(self.hidden_width, self.observation_latent)
         self.decoder_start = DecoderStart(self.hidden_width, pytorch_init=True)
         self.decoder = recording_decoder(

@@ -52,8 +52,8 @@ def encode_frames(p, x):
     return x.reshape(len(x), -1)
 
 
-def decode_frames(p, codes, side):
-    """codes [n, 288] -> (image [n, side, side, C], mask [n, side, side, 1])."""
+def decode_frames(p, codes, side, mean=0.0):
+    """codes [n, 288], mean [C] -> (image [n, side, side, C], mask [n, side, side, 1])."""
     x, norm = codes.reshape(-1, 3, 3, 32), 0
     for layer, (size, padding) in enumerate(DECODER_DECONVOLUTIONS[side]):
         x = np.stack([convolution(p[f"Convolution_{layer}"], one, 1) for one in x])
@@ -63,8 +63,9 @@ def decode_frames(p, codes, side):
         x = np.stack([transposed_convolution(q, one, padding) for one in x])
         x = reference.relu(channel_batch_norm(p[f"ChannelBatchNorm_{norm + 1}"], x))
         norm += 2
-    out = reference.sigmoid(x @ p["pixels"]["kernel"] + p["pixels"]["bias"])
-    return out[..., :-1] - 0.5, out[..., -1:]
+    out = x @ p["pixels"]["kernel"] + p["pixels"]["bias"]
+    start = np.log((0.5 + np.asarray(mean)) / (0.5 - np.asarray(mean)))
+    return reference.sigmoid(out[..., :-1] + start) - 0.5, reference.sigmoid(out[..., -1:])
 
 
 def video_means(p, g, codes, first_frames):
@@ -90,8 +91,8 @@ def video_means(p, g, codes, first_frames):
     return np.stack(means, axis=1).reshape(len(g), num_steps - 1, -1)
 
 
-def still_means(p, g, side):
+def still_means(p, g, side, mean=0.0):
     """Means [n, side * side * C] of whole images; the mask is not used."""
     hidden = np.stack([reference.res_block(p["ResBlock_0"], one) for one in g])
-    image, _ = decode_frames(p["FrameDecoder_0"], reference.dense(p["Dense_0"], hidden), side)
+    image, _ = decode_frames(p["FrameDecoder_0"], reference.dense(p["Dense_0"], hidden), side, mean)
     return image.reshape(len(g), -1)

@@ -14,6 +14,7 @@ from test_hvae import random_variables
 from jaxnew.finiteness import cause_of
 from jaxnew.representation import images, objective
 from jaxnew.representation.config import RepresentationConfig
+from jaxnew.representation.encoders import AS_GIVEN
 from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.learner import RepresentationLearner
 from jaxnew.representation.modality import Modality, image_modality
@@ -73,8 +74,8 @@ def test_frames_become_codes_and_codes_become_frames(side):
     np.testing.assert_allclose(running["var"], 0.9 + 0.1 * both.var((0, 1, 2)), rtol=1e-3)
 
     decoder = images.FrameDecoder((side, side, 2))
-    variables = variables_of(decoder, codes, True)
-    (image, mask), _ = in_training(decoder, variables, codes)
+    variables = variables_of(decoder, codes, 0.0, True)
+    (image, mask), _ = in_training(decoder, variables, codes, 0.0)
     assert (image.shape, mask.shape) == ((2, side, side, 2), (2, side, side, 1))
     plain = reference.as_float64(variables["params"])
     expected_image, expected_mask = image_reference.decode_frames(
@@ -107,8 +108,8 @@ def test_a_video_is_drawn_over_its_first_frame():
     features = RNG.uniform(-0.5, 0.5, (1, 2, 3, 48 * 48)).astype(np.float32)
     g = np.abs(RNG.normal(size=(12, 1, 2))).astype(np.float32)
     codes = RNG.normal(size=(1, 2, 288)).astype(np.float32)
-    variables = variables_of(decoder, g, codes, features, True)
-    got, _ = in_training(decoder, variables, g, codes, features)
+    variables = variables_of(decoder, g, codes, features, AS_GIVEN, True)
+    got, _ = in_training(decoder, variables, g, codes, features, AS_GIVEN)
     plain = reference.as_float64(variables["params"])
     all_codes = np.repeat(codes[0].astype(np.float64)[:, None], 3, axis=1)
     first = features[0, :, 0].reshape(2, *VIDEO).astype(np.float64)
@@ -124,10 +125,12 @@ def test_a_still_image_is_drawn_and_scored_as_a_whole():
     features = RNG.uniform(-0.5, 0.5, (1, 2, 1, size)).astype(np.float32)
     g = np.abs(RNG.normal(size=(12, 1, 2))).astype(np.float32)
     codes = np.zeros((1, 2, 288), np.float32)
-    variables = variables_of(decoder, g, codes, features, True)
-    got, _ = in_training(decoder, variables, g, codes, features)
+    scales = AS_GIVEN._replace(mean=np.array([-0.45, 0.0, 0.2], np.float32))
+    variables = variables_of(decoder, g, codes, features, scales, True)
+    got, _ = in_training(decoder, variables, g, codes, features, scales)
     plain = reference.as_float64(variables["params"])
-    expected = image_reference.still_means(plain, g[:, 0].T.astype(np.float64), 84)
+    from_decoder = g[:, 0].T.astype(np.float64)
+    expected = image_reference.still_means(plain, from_decoder, 84, scales.mean)
     np.testing.assert_allclose(got[0, :, 0], expected, **TOLERANCE)
 
     zeros = np.zeros((1, 2, 3), np.float32)
