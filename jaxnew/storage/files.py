@@ -134,8 +134,17 @@ def check_new(path: Path, overwrite: bool) -> None:
             raise StorageError(
                 f"{path} exists already. Name another --output, or give --overwrite to replace it."
             )
-        path.parent.mkdir(parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=path.parent).close()
+        make_writable(path.parent)
+
+
+def make_writable(folder: Path) -> None:
+    """Makes the folder if it is absent.
+
+    Raises:
+      OSError: nothing can be written there.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    tempfile.TemporaryFile(dir=folder).close()
 
 
 def read_json(path: Path, error: type[ValueError], kind: type = dict) -> Any:

@@ -8,12 +8,12 @@ import importlib
 import importlib.metadata
 import importlib.util
 import sys
-import tempfile
 from collections.abc import Iterator, Mapping
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any, TypeVar
 
+from jaxnew.storage.files import make_writable
 from jaxnew.storage.progress import say
 
 Budget = TypeVar("Budget")
@@ -117,13 +117,12 @@ def check_output(folder: Path | str, instead: str = "choose another folder") -> 
     """
     folder = Path(folder)
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
+        make_writable(folder)
     except OSError as err:
         raise UsageError(
             f"Nothing can be written in {folder} ({err.strerror}); {instead}."
         ) from err
+    return folder
 
 
 def budget_of(presets: Mapping[str, Budget], name: str, what: str) -> Budget:
