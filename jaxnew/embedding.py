@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from flax.traverse_util import flatten_dict, unflatten_dict
 
 from jaxnew import loop
 from jaxnew.actions import ActionIdentity, ActionSplit, check_same
@@ -24,20 +25,22 @@ from jaxnew.recording import (
 )
 from jaxnew.representation import report
 from jaxnew.representation.config import RepresentationConfig
-from jaxnew.representation.learner import RepresentationLearner, RepresentationState
+from jaxnew.representation.learner import EncoderWeights, RepresentationLearner
 from jaxnew.representation.modality import Modality
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
-from jaxnew.storage.checkpoint import Checkpointer
+from jaxnew.storage.arrays import read_arrays, write_arrays
+from jaxnew.storage.checkpoint import Checkpointer, CheckpointError
 from jaxnew.storage.config import Assignments, ConfigError, from_dict
 from jaxnew.storage.progress import say
 from jaxnew.storage.run_directory import RunDirectory
 from jaxnew.task.budgets import StageOneBudget, scaled_cost
 from jaxnew.task.domain import Domain, load_task
-from jaxnew.task.places import UsageError, trusting
+from jaxnew.task.places import UsageError, place_of, trusting
 from jaxnew.task.settings import EmbedConfig, identity, upgraded, with_set
 from jaxnew.task.task import Play, Task
 
 TABLE_FILE = "table.npz"
+WEIGHTS_FILE = "weights.npz"
 SPLIT_FILE = "split.json"
 
 
@@ -63,7 +66,7 @@ class Encoder:
         """The encoder of a run of `embed`.
 
         Args:
-          path: the run directory.
+          path: the run directory, or `pretrained:NAME` for one that comes with jaxnew.
           task: in place of the one that the run names, for a task that no name or place leads to.
           trust: import the `package.module` that it names as its task, installed or not.
 
@@ -71,7 +74,7 @@ class Encoder:
           RunDirectoryError, ConfigError: `path` is no such run.
           SplitMismatch: its table was exchanged for another.
         """
-        directory = RunDirectory.load(path)
+        directory = RunDirectory.load(place_of(path))
         if "model" not in directory.config:
             raise ConfigError(f"{path} is no run of an encoder: its config has no model.")
         config = from_dict(EmbedConfig, upgraded(directory.config))
@@ -116,7 +119,7 @@ class Encoder:
           UsageError: training was interrupted, or the task has no such universe.
           CheckpointError: the run has no readable checkpoint.
         """
-        learner, state, play = self.frozen()
+        learner, weights, play = self.frozen()
         if self.table.play not in (None, play.seen.modality):
             raise ObservationsError(
                 f"{self.path} learned from {self.table.play!r}, and what is recorded today is "
@@ -127,7 +130,7 @@ class Encoder:
         alike = [each for each in plays if learner.modality.name in each.modalities]
         fitting = recordings.fits((alike or [play])[0].seen)
         return RepresentationTable(
-            vectors=learner.encode(state, fitting.data),
+            vectors=learner.encode(weights, fitting.data),
             ids=fitting.ids,
             universe_hash=fitting.universe_hash,
             split_hash=self.config.split_hash,
@@ -137,15 +140,18 @@ class Encoder:
             identity=fitting.identity,
         )
 
-    def frozen(self) -> tuple[RepresentationLearner, RepresentationState, Play]:
-        """The learner, its state at the end, and the play whose recordings it reads."""
+    def frozen(self) -> tuple[RepresentationLearner, EncoderWeights, Play]:
+        """The learner, its weights at the end, and the play whose recordings it reads."""
         model = self.config.model
         _, play, modality = parse_representation(self.domain(), self.config.representation)
         learner = RepresentationLearner(model, modality)
         shape = (model.actions_per_batch * 8, model.recordings_per_action, *play.seen.shape)
         example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
+        if (self.path / WEIGHTS_FILE).exists():
+            return learner, _read_weights(self.path / WEIGHTS_FILE, example.weights), play
+        # A run of before version 0.4.0.
         state, _ = Checkpointer(self.path / "checkpoints").restore("latest", example)
-        return learner, state, play
+        return learner, state.weights, play
 
     def report(self) -> dict[str, Any]:
         """Purity and linear R2 of its table, see `jaxnew.representation.report.describe`; also kept
@@ -298,6 +304,8 @@ def _train(
     if result.was_interrupted or is_made:
         return result.interrupted_by
     domain.split.save(directory.path / SPLIT_FILE)
+    weights = flatten_dict(vars(result.state.weights), sep="/")
+    write_arrays(directory.path / WEIGHTS_FILE, weights)
     table = RepresentationTable(
         vectors=learner.encode(result.state, recordings.for_encoding()),
         ids=recordings.recorded.ids,
@@ -312,6 +320,19 @@ def _train(
     table.save(directory.path / TABLE_FILE)
     directory.add_provenance(table_hash=table.hash)
     return None
+
+
+def _read_weights(path: Path, example: EncoderWeights) -> EncoderWeights:
+    """The weights in a file, which are those of an encoder like `example`."""
+    expected = flatten_dict(vars(example), sep="/")
+    arrays = read_arrays(path, sorted(expected), CheckpointError)
+    found = {name: leaf.shape for name, leaf in arrays.items()}
+    if found != {name: leaf.shape for name, leaf in expected.items()}:
+        raise CheckpointError(
+            f"{path} holds the weights of another encoder than config.json describes. Restore the "
+            "files from a copy, or embed again with --overwrite."
+        )
+    return EncoderWeights(**unflatten_dict(arrays, sep="/"))
 
 
 def _with_always_available(split: ActionSplit, part: str) -> np.ndarray:
@@ -353,7 +374,7 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
     An encoder that is not there is trained now.
 
     Args:
-      representation: its name, or the path of a run or file.
+      representation: its name, or the path of a run or file, or `pretrained:NAME`.
       budget: of an encoder that has to be trained.
 
     Raises:
@@ -361,7 +382,7 @@ def find_table(domain: Domain, runs: Path, representation: str, budget: str) -> 
       InterruptedRunError: a signal stopped its training just now.
       SplitMismatch: the table belongs to another universe or split.
     """
-    path = Path(representation)
+    path = place_of(representation)
     if representation in domain.universe.engineered:
         table = engineered_table(domain.universe, representation)
     elif match := re.fullmatch(r"random-(\d+)", representation):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -12,8 +11,7 @@ import numpy as np
 
 from jaxnew import actions
 from jaxnew.actions import ActionIdentity, ActionUniverse, content_hash
-from jaxnew.storage.arrays import read_arrays
-from jaxnew.storage.files import write_bytes_atomically
+from jaxnew.storage.arrays import read_arrays, write_arrays
 
 UNKNOWN_MODALITY = "unknown"
 
@@ -159,9 +157,7 @@ class Recordings:
         arrays: dict[str, Any] = {"ids": self.ids, "recordings": self.data}
         arrays |= {name: np.array(text) for name, text in texts.items() if text is not None}
         arrays |= self.identity.arrays() if self.identity else {}
-        buffer = io.BytesIO()
-        np.savez_compressed(buffer, **arrays)
-        write_bytes_atomically(Path(path), buffer.getvalue())
+        write_arrays(Path(path), arrays, is_compressed=True)
 
     @classmethod
     def load(cls, path: Path | str) -> Recordings:

@@ -306,7 +306,7 @@ def sweep(
     check_run(task, trainer.rollout, configs[0].method, np.asarray(trainer.training.table))
     program = SweepProgram.of(trainer, configs, jax.devices(), members_at_once)
     members = [identity(config) for config in configs]
-    words = ["sweep", file_name(method), Path(name).stem]
+    words = ["sweep", file_name(method), Path(name).stem.replace(":", "-")]
     words += [domain.split_label] * (domain.split_label != task.default_split)
     words += [budget, *(vary or {}), _digest(members)]
     path = Path(workdir or domain.folder(runs) / "-".join(words))

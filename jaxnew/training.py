@@ -84,7 +84,7 @@ def train(
     name, found = named_table(domain, runs, table, budget, representation_budget)
     preset = task.budget(budget)
     config = with_set(train_config(domain, method, name, found, preset, seed), set)
-    title = f"{file_name(method)}-{Path(name).name.removesuffix('.npz')}"
+    title = f"{file_name(method)}-{Path(name).name.removesuffix('.npz').replace(':', '-')}"
     path = domain.folder(runs) / f"{title}-{domain.split_label}-{budget}-{seed}"
     path = Path(workdir) if workdir else path
     with Trainer.of(config, task, domain.split, found, num_workers) as trainer:

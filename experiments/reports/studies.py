@@ -230,7 +230,7 @@ def encoded_test_actions(
     trained = Encoder.load(encoder)
     if trained.config.split_hash != split.hash:
         raise UsageError(f"{encoder} was trained with another split than the policy.")
-    learner, state, play = trained.frozen()
+    learner, weights, play = trained.frozen()
     sizes = sorted(
         int(folder.name.rpartition("-")[2]) for folder in encoder.parent.glob(f"{play.folder}-*")
     )
@@ -246,7 +246,7 @@ def encoded_test_actions(
     domain = trained.domain()
     recordings = collect(domain, encoder.parent.parent, sizes[-1], play)
     return RepresentationTable(
-        vectors=learner.encode(state, recordings.for_encoding(split.test, num_recordings)),
+        vectors=learner.encode(weights, recordings.for_encoding(split.test, num_recordings)),
         ids=split.test,
         encoder_hash=trained.table.made_by,
         identity=ActionIdentity.of(domain.universe, split.test),

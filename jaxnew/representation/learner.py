@@ -39,6 +39,19 @@ _ENCODED_FEATURES = 2**24
 
 
 @struct.dataclass
+class EncoderWeights:
+    """All that encoding reads.
+
+    Attributes:
+      params: network parameters, f32 leaves.
+      batch_stats: running averages, f32 leaves.
+    """
+
+    params: Any
+    batch_stats: Any
+
+
+@struct.dataclass
 class RepresentationState:
     """All that training changes.
 
@@ -57,6 +70,11 @@ class RepresentationState:
     key_epochs: jax.Array
     key_steps: jax.Array
     step: jax.Array
+
+    @property
+    def weights(self) -> EncoderWeights:
+        """What an encoder keeps of it."""
+        return EncoderWeights(self.params, self.batch_stats)
 
 
 class RepresentationLearner:
@@ -139,16 +157,16 @@ class RepresentationLearner:
 
     def encode(
         self,
-        state: RepresentationState,
+        weights: EncoderWeights | RepresentationState,
         recordings: jax.Array | np.ndarray | RecordingSource,
         batch: int | None = None,
     ) -> np.ndarray:
         """Action representations: the posterior means of `encode_posterior`, f32[A, d]."""
-        return self.encode_posterior(state, recordings, batch)[0]
+        return self.encode_posterior(weights, recordings, batch)[0]
 
     def encode_posterior(
         self,
-        state: RepresentationState,
+        weights: EncoderWeights | RepresentationState,
         recordings: jax.Array | np.ndarray | RecordingSource,
         batch: int | None = None,
     ) -> tuple[np.ndarray, np.ndarray]:
@@ -158,7 +176,7 @@ class RepresentationLearner:
         recordings per action, which need not be that of training.
 
         Args:
-          state: trained state; only its parameters and running averages are read.
+          weights: of an encoder, or the state of its training.
           recordings: [A, S, T, D0], stored dtype; may stay on the host, or be a source.
           batch: actions encoded at a time; bounds memory, does not change the result beyond
             rounding. Default: 8, or as many as have 2^24 features, but at least one.
@@ -183,7 +201,7 @@ class RepresentationLearner:
             raise ValueError(f"batch={batch} must be at least 1.")
         parts: list[Any] = []
         for chunk in padded_chunks(recordings, batch):
-            parts.append(self._posterior(state.params, state.batch_stats, chunk))
+            parts.append(self._posterior(weights.params, weights.batch_stats, chunk))
             # At most one chunk waits while another is encoded, so that memory is bounded.
             parts[-2:-1] = jax.device_get(parts[-2:-1])
         means, log_variances = zip(*jax.device_get(parts), strict=True)

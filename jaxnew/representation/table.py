@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,8 +16,7 @@ from jaxnew.actions import (
     checked_ids,
     content_hash,
 )
-from jaxnew.storage.arrays import read_arrays
-from jaxnew.storage.files import write_bytes_atomically
+from jaxnew.storage.arrays import read_arrays, write_arrays
 
 _TEXTS = ("universe_hash", "split_hash", "source", "play", "encoder_hash", "hash")
 
@@ -125,9 +123,7 @@ class RepresentationTable:
         arrays: dict[str, Any] = {"vectors": self.vectors, "ids": self.ids}
         arrays |= {name: np.array(text) for name, text in texts.items() if text is not None}
         arrays |= self.identity.arrays() if self.identity else {}
-        buffer = io.BytesIO()
-        np.savez(buffer, **arrays)
-        write_bytes_atomically(Path(path), buffer.getvalue())
+        write_arrays(Path(path), arrays)
 
     @classmethod
     def load(cls, path: Path | str) -> RepresentationTable:

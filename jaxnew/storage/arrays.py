@@ -1,16 +1,18 @@
-"""Reading of `.npz` files."""
+"""Files of arrays, `.npz`."""
 
 from __future__ import annotations
 
 import errno
+import io
 import zipfile
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from jaxnew.storage.files import StorageError, access
+from jaxnew.storage.files import StorageError, access, write_bytes_atomically
 
 # All that `numpy.load` was seen to raise on cut or foreign files.
 _DAMAGE = (
@@ -23,6 +25,13 @@ _DAMAGE = (
     zipfile.BadZipFile,
     zlib.error,
 )
+
+
+def write_arrays(path: Path, arrays: Mapping[str, Any], is_compressed: bool = False) -> None:
+    """Writes the file, whole or not at all."""
+    buffer = io.BytesIO()
+    (np.savez_compressed if is_compressed else np.savez)(buffer, **arrays)
+    write_bytes_atomically(path, buffer.getvalue())
 
 
 def read_arrays(path: Path, names: Sequence[str], error: type[ValueError]) -> dict[str, np.ndarray]:

@@ -16,6 +16,9 @@ from typing import Any, TypeVar
 from jaxnew.storage.files import make_writable
 from jaxnew.storage.progress import say
 
+PRETRAINED = "pretrained"
+_SHIPPED = Path(__file__).parents[1] / PRETRAINED
+
 Budget = TypeVar("Budget")
 _TRUSTS: ContextVar[bool] = ContextVar("trusts", default=False)
 
@@ -104,6 +107,21 @@ def file_of(name: str, allowed: str) -> Path:
     except OSError as err:  # Such as a name that is too long.
         raise UsageError(f"{name!r} is no file ({err.strerror}). {allowed}") from err
     raise UsageError(f"There is no file {name!r}. {allowed}")
+
+
+def place_of(path: Path | str) -> Path:
+    """Where `pretrained:NAME` lies, which comes with jaxnew; any other path as it is.
+
+    Raises:
+      UsageError: nothing of that name comes with jaxnew.
+    """
+    kind, _, name = str(path).partition(":")
+    if kind != PRETRAINED:
+        return Path(path)
+    names = sorted(folder.name for folder in _SHIPPED.iterdir() if folder.is_dir())
+    if name not in names:
+        raise UsageError(f"There is no {path}; there is {', '.join(names)}.")
+    return _SHIPPED / name
 
 
 def check_output(folder: Path | str, instead: str = "choose another folder") -> Path:

@@ -92,10 +92,10 @@ def test_flags_of_the_other_kind_are_refused() -> None:
 @pytest.mark.integration
 def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> None:
     split = ActionSplit.load(runs / POLICY / "split.json")
-    learner, state, _ = Encoder.load(runs / ENCODER).frozen()
+    learner, weights, _ = Encoder.load(runs / ENCODER).frozen()
     recordings = collection.load(runs / "recordings-16", universe=TASK.make_universe())
     rows = recordings.rows(split.test)
-    expected = learner.encode(state, recordings.data[rows][:, :4])
+    expected = learner.encode(weights, recordings.data[rows][:, :4])
     found = encoded_test_actions(runs / ENCODER, split, 4)
     np.testing.assert_array_equal(found.vectors, expected)
     table = RepresentationTable.load(runs / POLICY / "table.npz")

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import io
 import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 import pytest
 
 from jaxnew.actions import SplitMismatch
-from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, Encoder, embed, find_table
+from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, WEIGHTS_FILE, Encoder, embed, find_table
 from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.recording import REPRESENTATION_SEED, collect, parse_representation
 from jaxnew.representation.table import engineered_table, random_table
+from jaxnew.storage.checkpoint import CheckpointError
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory
@@ -193,8 +197,28 @@ def test_new_recordings_are_encoded(encoder: Encoder, tmp_path: Path) -> None:
     np.savez(tmp_path / "wrong.npz", ids=ids, recordings=np.zeros((2, 2, 9), np.float32))
     with pytest.raises(ObservationsError, match=r"expected \(2, 2, 3, 2\)"):
         encoder.encode(Recordings.load(tmp_path / "wrong.npz"))
-    learner, state, play = encoder.frozen()
-    assert (learner.config, int(state.step), play.seen) == (encoder.config.model, 4, seen)
+    learner, _, play = encoder.frozen()
+    assert (learner.config, play.seen) == (encoder.config.model, seen)
+
+
+def test_weights_of_other_files(encoder: Encoder, tmp_path: Path) -> None:
+    """Those of a checkpoint, as older runs keep them; damaged ones; those of another encoder."""
+    copy = tmp_path / "copy"
+    shutil.copytree(encoder.path, copy)
+    mine = replace(encoder, path=copy)
+    file = copy / WEIGHTS_FILE
+    kept = file.read_bytes()
+    file.unlink()
+    jax.tree.map(np.testing.assert_array_equal, mine.frozen()[1], encoder.frozen()[1])
+    file.write_bytes(kept[:-100])
+    with pytest.raises(CheckpointError, match=f"{file} is damaged"):
+        mine.frozen()
+    arrays = dict(np.load(io.BytesIO(kept)))
+    name, leaf = next((name, leaf) for name, leaf in arrays.items() if leaf.ndim == 2)
+    for other in ({**arrays, name: leaf.T[:-1]}, {**arrays, "params/more": leaf}):
+        np.savez(file, **other)
+        with pytest.raises(CheckpointError, match=r"another encoder than config\.json describes"):
+            mine.frozen()
 
 
 def test_its_report_is_kept(encoder: Encoder) -> None:
