@@ -9,7 +9,9 @@ existed before into representations (paper algorithm 2).
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 from experiments.flags import Arguments
 from jaxnew.embedding import Encoder, embed
@@ -73,18 +75,27 @@ def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None
 
 
 def print_report(encoder: Encoder) -> None:
-    """Prints purity and linear R2 of a table."""
-    numbers = encoder.report()
+    """Prints what a table tells of actions, beside random, untrained and engineered vectors."""
+    tables = {"encoder": encoder.report(), **encoder.references()}
+    rows = {name: _cells(numbers) for name, numbers in tables.items()}
+    labels = list(rows["encoder"])
+    width = max(map(len, labels))
+    print(f"\n{encoder.table.source} (docs/method.md, Representation table and its report)")
+    print(" " * width, *(f"{name:>9}" for name in rows))
+    for label in labels:
+        print(f"{label:<{width}}", *(f"{cells[label]:>9}" for cells in rows.values()))
+    print(f"More in {encoder.path / 'evaluation' / 'representation.json'}.")
+
+
+def _cells(numbers: Mapping[str, Any]) -> dict[str, str]:
+    """The numbers of one table by what they are."""
+    found = {"5-NN purity": numbers["purity_all"], "of held-out": numbers["purity_held_out"]}
+    for title, name in (("5-NN R2", "neighbour_r2"), ("linear R2", "linear_r2_mean")):
+        found |= {f"{title} to {fact}": r2 for fact, r2 in numbers[name].items()}
     entries = numbers["entries"]
-    explained = "".join(
-        f"; linear R2 to {name} {value:.2f}" for name, value in numbers["linear_r2_mean"].items()
-    )
-    print(
-        f"{encoder.table.source}: 5-NN purity {numbers['purity_all']:.3f}, held out "
-        f"{numbers['purity_held_out']:.3f}{explained}; {entries['active_dimensions']} of "
-        f"{entries['dimensions']} dimensions vary between actions (std > 0.1). All in "
-        f"{encoder.path / 'evaluation' / 'representation.json'}."
-    )
+    active = f"{entries['active_dimensions']}/{entries['dimensions']}"
+    plain = {label: "-" if value is None else f"{value:.3f}" for label, value in found.items()}
+    return plain | {"dimensions that vary": active}
 
 
 if __name__ == "__main__":

@@ -41,6 +41,8 @@ from jaxnew.task.task import Play, Task
 
 TABLE_FILE = "table.npz"
 WEIGHTS_FILE = "weights.npz"
+UNTRAINED_FILE = "untrained.npz"  # What the encoder made of actions before it was trained.
+_RECORDINGS_UNTRAINED = 16
 SPLIT_FILE = "split.json"
 
 
@@ -154,21 +156,42 @@ class Encoder:
         return learner, state.weights, play
 
     def report(self) -> dict[str, Any]:
-        """Purity and linear R2 of its table, see `jaxnew.representation.report.describe`; also kept
-        in `evaluation/representation.json`.
+        """What its table tells of actions, see `jaxnew.representation.report.describe`.
+
+        Also kept in `evaluation/representation.json`.
         """
-        universe = self.task.make_universe().first(len(self.table.ids))
         split = ActionSplit.load(self.path / SPLIT_FILE)
         check_same("split", split.hash, self.config.split_hash, self.path)
-        targets = self.task.shown.representation_targets
-        numbers = report.describe(
-            self.table.vectors,
-            universe.class_labels,
-            held_out=sorted({*split.validation.tolist(), *split.test.tolist()}),
-            targets=targets(universe) if targets else {},
-        )
+        numbers = _described(self.task, split, self.table.vectors)
         RunDirectory.load(self.path).record_evaluation("representation", numbers)
         return numbers
+
+    def references(self) -> dict[str, dict[str, Any]]:
+        """The same for tables beside which its own is to be seen.
+
+        `random` vectors, the encoder `untrained` (unless the run is of before version 0.4.0), and
+        the task's engineered vectors by their names.
+        """
+        split = ActionSplit.load(self.path / SPLIT_FILE)
+        num_actions, size = self.table.vectors.shape
+        universe = self.task.make_universe().first(num_actions)
+        vectors = {"random": random_table(universe, size, REPRESENTATION_SEED).vectors}
+        if (self.path / UNTRAINED_FILE).exists():
+            vectors["untrained"] = RepresentationTable.load(self.path / UNTRAINED_FILE).vectors
+        vectors |= universe.engineered
+        return {name: _described(self.task, split, each) for name, each in vectors.items()}
+
+
+def _described(task: Task, split: ActionSplit, vectors: np.ndarray) -> dict[str, Any]:
+    """`report.describe` of vectors f32[A, d] of the first A actions of a task."""
+    universe = task.make_universe().first(len(vectors))
+    targets = task.shown.representation_targets
+    return report.describe(
+        vectors,
+        universe.class_labels,
+        held_out=sorted({*split.validation.tolist(), *split.test.tolist()}),
+        targets=targets(universe) if targets else {},
+    )
 
 
 def embed(
@@ -288,8 +311,9 @@ def _train(
     chunk_steps = min(preset.chunk_steps, preset.checkpoint_every)
     if not is_made:
         say(f"Training {name} ({model.num_steps} steps; {preset.cost}) in {directory.path}.")
+    start = learner.init(jax.random.key(config.seed), data.shape)
     result = loop.run(
-        learner.init(jax.random.key(config.seed), data.shape),
+        start,
         lambda state, n: learner.train_steps(state, data, n),
         directory,
         loop.Rhythm(model.num_steps, chunk_steps, preset.checkpoint_every),
@@ -304,6 +328,11 @@ def _train(
     if result.was_interrupted or is_made:
         return result.interrupted_by
     domain.split.save(directory.path / SPLIT_FILE)
+    few = min(_RECORDINGS_UNTRAINED, recordings.recorded.num_recordings)
+    untrained = learner.encode(start, recordings.for_encoding(num_recordings=few))
+    RepresentationTable(untrained, recordings.recorded.ids, source=f"untrained {name}").save(
+        directory.path / UNTRAINED_FILE
+    )
     weights = flatten_dict(vars(result.state.weights), sep="/")
     write_arrays(directory.path / WEIGHTS_FILE, weights)
     table = RepresentationTable(

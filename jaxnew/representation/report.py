@@ -63,6 +63,46 @@ def neighbour_purity(
     return float(np.mean(labels[neighbours] == labels[:, None]))
 
 
+def neighbour_r2(
+    vectors: np.ndarray,
+    targets: np.ndarray,
+    held_out: Sequence[int] | np.ndarray,
+    num_neighbours: int = NUM_NEIGHBOURS,
+) -> float:
+    """How much of the facts about held-out actions their nearest train actions tell.
+
+    A held-out action's facts are predicted as the mean of those of its nearest neighbours among the
+    other actions: `1 - squared error / squared deviation from the held-out mean`, of all facts.
+
+    Args:
+      vectors: f[A, d].
+      targets: f[A, ...] facts, all in one unit.
+      held_out: rows that are predicted, from the rest.
+      num_neighbours: k.
+    Returns:
+      At most 1; about -1/k where neighbours tell nothing, NaN where all held-out facts are equal.
+
+    Raises:
+      ValueError: fewer than k rows are not held out.
+    """
+    from sklearn.neighbors import KNeighborsRegressor
+
+    held_out = np.unique(np.asarray(held_out, int))
+    others = np.setdiff1d(np.arange(len(vectors)), held_out)
+    if len(others) < num_neighbours:
+        raise ValueError(
+            f"{num_neighbours} nearest neighbours need as many actions that are not held out; got "
+            f"{len(others)}."
+        )
+    facts = np.asarray(targets, np.float64).reshape(len(vectors), -1)
+    model = KNeighborsRegressor(num_neighbours, algorithm="brute")
+    model.fit(np.asarray(vectors[others], np.float64), facts[others])
+    error = facts[held_out] - model.predict(np.asarray(vectors[held_out], np.float64))
+    deviation = facts[held_out] - facts[held_out].mean(axis=0)
+    total = float(np.sum(deviation**2))
+    return 1.0 - float(np.sum(error**2)) / total if total > 0.0 else float("nan")
+
+
 def linear_r2(vectors: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """In-sample R2 of ordinary least squares with intercept, per target column.
 
@@ -108,10 +148,13 @@ def describe(
       held_out: rows outside the train split, for the second purity: validation and test together.
       targets: by name f[A, ...], what a linear map of the representation should explain.
     """
-    explained = {name: linear_r2(vectors, values) for name, values in (targets or {}).items()}
+    targets = targets or {}
+    explained = {name: linear_r2(vectors, values) for name, values in targets.items()}
+    told = {name: neighbour_r2(vectors, values, held_out) for name, values in targets.items()}
     return {
         "purity_all": neighbour_purity(vectors, labels),
         "purity_held_out": neighbour_purity(vectors, labels, held_out),
+        "neighbour_r2": {name: _plain(value) for name, value in told.items()},
         "linear_r2": {name: _plain(values) for name, values in explained.items()},
         "linear_r2_mean": {name: _plain(values.mean()) for name, values in explained.items()},
         "entries": entry_statistics(vectors),
@@ -132,8 +175,8 @@ def tsne(vectors: np.ndarray, seed: int) -> np.ndarray:
     return TSNE(n_components=2, perplexity=10, random_state=seed).fit_transform(vectors)
 
 
-def _plain(values: np.ndarray) -> Any:
+def _plain(values: np.ndarray | float) -> Any:
     """Floats for JSON, which has no NaN: None instead."""
     if np.ndim(values):
-        return [_plain(value) for value in values]
+        return [_plain(value) for value in np.asarray(values)]
     return float(values) if np.isfinite(values) else None

@@ -14,10 +14,18 @@ import numpy as np
 import pytest
 
 from jaxnew.actions import SplitMismatch
-from jaxnew.embedding import SPLIT_FILE, TABLE_FILE, WEIGHTS_FILE, Encoder, embed, find_table
+from jaxnew.embedding import (
+    SPLIT_FILE,
+    TABLE_FILE,
+    UNTRAINED_FILE,
+    WEIGHTS_FILE,
+    Encoder,
+    embed,
+    find_table,
+)
 from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.recording import REPRESENTATION_SEED, collect, parse_representation
-from jaxnew.representation.table import engineered_table, random_table
+from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import CheckpointError
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.metrics import read
@@ -225,6 +233,14 @@ def test_its_report_is_kept(encoder: Encoder) -> None:
     numbers = encoder.report()
     assert RunDirectory.load(encoder.path).evaluation("representation") == numbers
     assert "rungs" in json.dumps(numbers)
+    others = encoder.references()
+    assert list(others) == ["random", "untrained", "gt3"]
+    assert all(other.keys() == numbers.keys() and other != numbers for other in others.values())
+    learner, _, _ = encoder.frozen()
+    data = collect(DOMAIN, encoder.path.parents[1], 3)
+    start = learner.init(jax.random.key(encoder.config.seed), (8, 3, 3, 2))
+    untrained = RepresentationTable.load(encoder.path / UNTRAINED_FILE)
+    np.testing.assert_array_equal(learner.encode(start, data.recorded.data), untrained.vectors)
 
 
 def test_an_interrupted_run_has_no_table(encoder: Encoder, tmp_path: Path) -> None:

@@ -64,6 +64,26 @@ def test_linear_r2_is_one_for_affine_maps_and_low_for_noise():
     assert report.linear_r2(vectors, affine.reshape(400, 1, 2)).shape == (2,)
 
 
+@pytest.mark.oracle
+def test_what_neighbours_tell_equals_a_loop():
+    rng = np.random.default_rng(3)
+    vectors, facts = rng.normal(size=(40, 3)), rng.normal(size=(40, 2)) * [1.0, 5.0]
+    facts[:, 0] += 4 * vectors[:, 0]
+    held_out = np.arange(0, 40, 3)
+    others = np.setdiff1d(np.arange(40), held_out)
+    error = 0.0
+    for row in held_out:
+        order = np.argsort([np.linalg.norm(vectors[row] - vectors[other]) for other in others])
+        error += np.sum((facts[row] - facts[others[order[:5]]].mean(axis=0)) ** 2)
+    total = len(held_out) * facts[held_out].var(axis=0).sum()
+    found = report.neighbour_r2(vectors, facts[:, None], held_out)
+    assert found == pytest.approx(1.0 - error / total)
+    assert report.neighbour_r2(facts, facts, held_out) > 0.5 > found
+    assert np.isnan(report.neighbour_r2(vectors, np.ones(40), held_out))
+    with pytest.raises(ValueError, match="as many actions that are not held out; got 4"):
+        report.neighbour_r2(vectors, facts, np.arange(36))
+
+
 @pytest.mark.unit
 def test_entry_statistics_count_active_dimensions():
     vectors = np.array([[0.0, 1.0, -1.0], [0.19, 1.0, 1.0]])
@@ -86,7 +106,8 @@ def test_describe_is_plain_json():
     assert again == numbers
     assert numbers["purity_all"] == numbers["purity_held_out"] == 1.0
     assert numbers["linear_r2"]["x"][0] == pytest.approx(1.0, abs=0.01)
-    constant = report.describe(vectors, labels, range(16), {"c": np.ones((16, 1))})
+    assert numbers["neighbour_r2"]["x"] is None  # All held-out labels are alike.
+    constant = report.describe(vectors, labels, range(8), {"c": np.ones((16, 1))})
     assert constant["linear_r2"]["c"] == [None]
 
 
