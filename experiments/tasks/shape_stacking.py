@@ -46,8 +46,9 @@ _HVAE = RepresentationConfig(
 )
 
 
-def _stage_one(num_recordings: int, checkpoint_every: int, cost: str, **model: Any) -> Any:
-    hvae = replace(_HVAE, **model)
+def _stage_one(
+    hvae: RepresentationConfig, num_recordings: int, checkpoint_every: int, cost: str
+) -> StageOneBudget:
     return StageOneBudget(
         num_recordings, hvae, replace(hvae, kind="vae"), checkpoint_every, cost, stores_drawn=True
     )
@@ -55,23 +56,19 @@ def _stage_one(num_recordings: int, checkpoint_every: int, cost: str, **model: A
 
 _STAGE_ONE = {
     "smoke": _stage_one(
+        _HVAE.in_minutes(num_steps=2, recordings_per_action=2, actions_per_batch=2),
         2,
         1,
         "half a minute on one core, most of it for compiling",
-        num_steps=2,
-        recordings_per_action=2,
-        actions_per_batch=2,
     ),
     "laptop": _stage_one(
+        _HVAE.in_minutes(num_steps=1800, recordings_per_action=4, actions_per_batch=16),
         64,
-        200,
-        "50 minutes on one core, and 1.1 GB on disk",
-        num_steps=5000,
-        recordings_per_action=4,
-        actions_per_batch=16,
+        100,
+        "half an hour on one core, and 1.1 GB on disk",
     ),
     "paper": replace(
-        _stage_one(1024, 500, "10 days on one core, from the rate of `laptop`"),
+        _stage_one(_HVAE, 1024, 500, "10 days on one core, from the rate of `laptop`"),
         stores_drawn=False,
         chunk_steps=10,
         counts_epochs=True,
