@@ -72,7 +72,8 @@ class FlatVAE(nn.Module):
     reads_changes: bool = False
 
     def setup(self) -> None:
-        self.encoder = recording_encoder(self.encoder_width, self.image_shape, self.reads_changes)
+        reads_changes = self.reads_changes and not self.is_still
+        self.encoder = recording_encoder(self.encoder_width, self.image_shape, reads_changes)
         num_channels = None if self.image_shape is None else self.image_shape[-1]
         self.scales = Standardization(self.standardizes, num_channels)
         self.inference = FlatInference(self.hidden_width, self.observation_latent)

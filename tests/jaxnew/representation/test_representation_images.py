@@ -200,6 +200,10 @@ def test_parameter_counts_are_the_specs_without_its_unused_layers():
     still = HVAE(**sizes, gaussian_dim=84 * 84 * 3, image_shape=STILL, is_still=True)
     assert count(video, 7) == 1_583_280 - unused == 1_549_968
     assert count(still, 1) == 1_429_938 - unused == 1_396_626
+    # Changes of codes are read by both directions of the LSTM; a still image has none.
+    changes = {"reads_changes": True, "predicts_changes": True, "standardizes": True}
+    assert count(replace(video, **changes), 7) == 1_549_968 + 2 * 288 * 4 * 128
+    assert count(replace(still, **changes), 1) == 1_396_626
 
 
 @pytest.mark.unit
