@@ -155,6 +155,20 @@ class Encoder:
         state, _ = Checkpointer(self.path / "checkpoints").restore("latest", example)
         return learner, state.weights, play
 
+    def export(self, folder: Path | str) -> Path:
+        """A copy for others, all that `load` and `encode` need: one or two megabytes.
+
+        Raises:
+          UsageError: its training was interrupted.
+          StorageError: the folder exists, or the system refuses.
+        """
+        if not self.is_finished:
+            raise UsageError(f"{self.path} was interrupted; embed again to go on.")
+        folder, (_, weights, _) = Path(folder), self.frozen()
+        RunDirectory.load(self.path).export(folder, (SPLIT_FILE, TABLE_FILE))
+        _write_weights(folder / WEIGHTS_FILE, weights)
+        return folder
+
     def report(self) -> dict[str, Any]:
         """What its table tells of actions, see `jaxnew.representation.report.describe`.
 
@@ -333,8 +347,7 @@ def _train(
     RepresentationTable(untrained, recordings.recorded.ids, source=f"untrained {name}").save(
         directory.path / UNTRAINED_FILE
     )
-    weights = flatten_dict(vars(result.state.weights), sep="/")
-    write_arrays(directory.path / WEIGHTS_FILE, weights)
+    _write_weights(directory.path / WEIGHTS_FILE, result.state.weights)
     table = RepresentationTable(
         vectors=learner.encode(result.state, recordings.for_encoding()),
         ids=recordings.recorded.ids,
@@ -349,6 +362,10 @@ def _train(
     table.save(directory.path / TABLE_FILE)
     directory.add_provenance(table_hash=table.hash)
     return None
+
+
+def _write_weights(path: Path, weights: EncoderWeights) -> None:
+    write_arrays(path, flatten_dict(vars(weights), sep="/"))
 
 
 def _read_weights(path: Path, example: EncoderWeights) -> EncoderWeights:

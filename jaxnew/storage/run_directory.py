@@ -36,7 +36,7 @@ import reprlib
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Self
 
@@ -50,6 +50,7 @@ from jaxnew.storage.files import (
     remove_temporaries,
     sync_folder,
     take_lock,
+    write_bytes_atomically,
     write_json_atomically,
 )
 from jaxnew.storage.session import describe_session
@@ -60,6 +61,7 @@ _LOCK = ".lock"
 _FOLDERS = ("tensorboard", "checkpoints", "figures", "evaluation")
 _OF_SWEEPS = ("members", "members.partial")
 _HASH = "hash"  # In files of evaluations.
+_PRIVATE = ("command", "machine", "devices")  # What a session records that is not exported.
 
 _SHORT = reprlib.Repr()  # Cuts groups of fields and long lists.
 _SHORT.maxlist, _SHORT.maxstring, _SHORT.maxother = 16, 200, 200
@@ -279,6 +281,29 @@ class RunDirectory:
         with access(self.path / "evaluation"):
             names = sorted(file.stem for file in self.path.glob("evaluation/[!.]*.json"))
         return {name: self.evaluation(name) for name in names}
+
+    def export(self, folder: Path, files: Sequence[str]) -> None:
+        """Copies what others need into a new folder, which can be loaded like the run.
+
+        Of each session its hashes, revision and versions; no commands, machines or checkpoints.
+
+        Args:
+          files: names of the files to be copied.
+
+        Raises:
+          StorageError: the folder exists, or the system refuses.
+        """
+        check_name(folder)
+        provenance = self.provenance
+        provenance["sessions"] = [
+            {name: session[name] for name in session if name not in _PRIVATE}
+            for session in provenance["sessions"]
+        ]
+        with access(folder, "written"):
+            folder.mkdir(parents=True)
+            for name in ("config.json", *files):
+                write_bytes_atomically(folder / name, (self.path / name).read_bytes())
+            write_json_atomically(folder / "provenance.json", provenance)  # Now it is a run.
 
     def close(self) -> None:
         """Releases the lock; the object can still be read."""

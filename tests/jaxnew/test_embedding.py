@@ -28,6 +28,7 @@ from jaxnew.recording import REPRESENTATION_SEED, collect, parse_representation
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.checkpoint import CheckpointError
 from jaxnew.storage.config import ConfigError
+from jaxnew.storage.files import StorageError
 from jaxnew.storage.metrics import read
 from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory
 from jaxnew.task.domain import Domain
@@ -227,6 +228,22 @@ def test_weights_of_other_files(encoder: Encoder, tmp_path: Path) -> None:
         np.savez(file, **other)
         with pytest.raises(CheckpointError, match=r"another encoder than config\.json describes"):
             mine.frozen()
+
+
+def test_an_export_is_small_and_says_nothing_of_its_maker(encoder: Encoder, tmp_path: Path) -> None:
+    exported = Encoder.load(encoder.export(tmp_path / "mine"), LADDER)
+    names = ["config.json", "provenance.json", "split.json", "table.npz", "weights.npz"]
+    assert sorted(file.name for file in exported.path.iterdir()) == names
+    for session in RunDirectory.load(exported.path).provenance["sessions"]:
+        assert not {"command", "machine", "devices"} & set(session)
+    assert exported.table.hash == encoder.table.hash
+    np.savez(tmp_path / "new.npz", ids=[0, 1], recordings=toy_device.record(5, np.arange(2), 2))
+    new = Recordings.load(tmp_path / "new.npz")
+    np.testing.assert_array_equal(exported.encode(new).vectors, encoder.encode(new).vectors)
+    with pytest.raises(StorageError, match="mine cannot be written: File exists"):
+        encoder.export(tmp_path / "mine")
+    with pytest.raises(UsageError, match="was interrupted"):
+        replace(encoder, _table=None).export(tmp_path / "other")
 
 
 def test_its_report_is_kept(encoder: Encoder) -> None:
