@@ -25,7 +25,9 @@ _OF_TRAINING = (
     *("overwrite", "set", "recordings", "frames"),
 )
 ARGUMENTS = Arguments(__doc__, *_OF_TRAINING, "trust", "debug_nans")
-ARGUMENTS.define("string", "checkpoint", None, "Run directory of a trained encoder.")
+ARGUMENTS.define(
+    "string", "checkpoint", None, "Run directory of a trained encoder, or pretrained:NAME."
+)
 ARGUMENTS.define("string", "observations", None, ".npz of ids and recordings to encode.")
 ARGUMENTS.define(
     "string",

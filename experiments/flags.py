@@ -32,8 +32,8 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
         "string",
         "hvae",
         "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot) "
-        "and -oracle (trained on all actions), random-SIZE, a run directory of embed, or an .npz "
-        "table.",
+        "and -oracle (trained on all actions), random-SIZE, a run directory of embed, an .npz "
+        "table, or pretrained:NAME.",
     ),
     "representation_budget": (
         "string",

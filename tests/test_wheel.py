@@ -79,3 +79,4 @@ def test_its_data_is_there(installed: Path, tmp_path: Path) -> None:
     ]
     assert output[4] == "True"
     assert (installed / "jaxnew" / "py.typed").is_file()
+    assert (installed / "jaxnew" / "pretrained" / "grid_world" / "weights.npz").is_file()
