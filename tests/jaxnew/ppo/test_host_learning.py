@@ -33,7 +33,6 @@ NUMBERS = Hyperparameters(learning_rate=3e-3, entropy_coefficient=0.005, clip=0.
 
 
 @pytest.mark.learning
-@pytest.mark.optimized
 def test_ours_learns_where_to_put_which_action() -> None:
     assert TASK.host is not None
     domain = Domain.of(TASK)
