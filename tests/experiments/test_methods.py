@@ -86,11 +86,13 @@ def test_a_fixed_set_of_5000_trains_and_is_evaluated(tmp_path: Path) -> None:
 def test_a_policy_goes_on_with_new_actions(runs: Path) -> None:
     """Both kinds of policy, warm and from scratch; the discrete head is as large as its set."""
     jobs, folders = [], []
-    for method in ("ours", "nearest-neighbour"):
+    for method, start, flags in (
+        ("ours", "warm", ()),
+        ("nearest-neighbour", "scratch", ("--scratch",)),
+    ):
         path = runs / "grid_world" / FOLDER.format("", method, "gt12")
-        for start, flags in (("warm", ()), ("scratch", ("--scratch",))):
-            jobs.append((f"--run={path}", "--budget=smoke", *flags))
-            folders.append(path / f"finetune-{start}-smoke-31")
+        jobs.append((f"--run={path}", "--budget=smoke", *flags))
+        folders.append(path / f"finetune-{start}-smoke-31")
     run_several("finetune", jobs)
     for folder in folders:
         assert read_json(folder / "config.json")["trained_on"] == "test"
