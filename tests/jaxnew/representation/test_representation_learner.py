@@ -376,6 +376,20 @@ def test_bad_configs_are_refused(changes, error, message):
 
 
 @pytest.mark.unit
+def test_encoders_in_minutes_keep_networks_and_the_weight_of_the_actions_divergence():
+    paper = learner.RepresentationConfig(hidden_width=7, recordings_per_action=464)
+    quick = paper.in_minutes(num_steps=9, recordings_per_action=4)
+    assert (quick.kl_recordings, quick.recordings_per_action, quick.num_steps) == (464, 4, 9)
+    batches = {"num_steps", "recordings_per_action", "kl_recordings"}
+    for field in dataclasses.fields(paper):
+        now, before = getattr(quick, field.name), getattr(paper, field.name)
+        is_changed = field.name in batches or (now is True and before is False)
+        assert is_changed or now == before, field.name
+    with pytest.raises(TypeError, match="num_stps"):
+        paper.in_minutes(num_stps=9)
+
+
+@pytest.mark.unit
 @pytest.mark.parametrize(
     ("changes", "shape", "message"),
     [
