@@ -147,7 +147,7 @@ class Encoder:
         model = self.config.model
         _, play, modality = parse_representation(self.domain(), self.config.representation)
         learner = RepresentationLearner(model, modality)
-        shape = (model.actions_per_batch * 8, model.recordings_per_action, *play.seen.shape)
+        shape = (model.actions_per_batch, model.recordings_per_action, *play.seen.shape)
         example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
         if (self.path / WEIGHTS_FILE).exists():
             return learner, _read_weights(self.path / WEIGHTS_FILE, example.weights), play

@@ -130,7 +130,7 @@ TASK = Task(
         "laptop": _stage_one(
             256,
             80,
-            "about two minutes on two cores",
+            "about two minutes on one core",
             num_steps=1600,
             actions_per_batch=64,
             recordings_per_action=8,

@@ -137,8 +137,8 @@ class Standardization(nn.Module):
 
     Attributes:
       is_active: False gives `AS_GIVEN`.
-      num_channels: C, where the D numbers are pixels of as many channels; scales are then of the
-        channels, f32[C], and `change` is that from pixel to pixel, which nobody reads.
+      num_channels: C, where the D numbers are pixels of as many channels: the mean is then of the
+        channels, f32[C], and all that there is.
     """
 
     is_active: bool
@@ -150,22 +150,24 @@ class Standardization(nn.Module):
         if not self.is_active:
             return AS_GIVEN
         if self.num_channels is not None:
-            features = features.reshape(-1, self.num_channels)
-        shape = features.shape[-1:]
-        mean = self.variable("batch_stats", "mean", jnp.zeros, shape)
-        variance = self.variable("batch_stats", "variance", jnp.ones, shape)
-        squared_change = self.variable("batch_stats", "squared_change", jnp.ones, shape)
-        kept = (mean, variance, squared_change)
-        if training:
-            axes = tuple(range(features.ndim - 1))
-            changes = jnp.mean(jnp.square(jnp.diff(features, axis=-2)), axes)
-            found = jnp.mean(features, axes), jnp.var(features, axes), changes
-            for old, new in zip(kept, found, strict=True):
-                old.value = 0.99 * old.value + 0.01 * new
-        else:
-            found = mean.value, variance.value, squared_change.value
+            pixels = features.reshape(-1, self.num_channels)
+            return AS_GIVEN._replace(mean=self._kept("mean", 0.0, pixels, training))
+        mean = self._kept("mean", 0.0, features, training)
+        variance = self._kept("variance", 1.0, jnp.square(features - mean), training)
+        changes = jnp.square(jnp.diff(features, axis=-2))
+        squared_change = self._kept("squared_change", 1.0, changes, training)
         # Numbers that never change are read as zero, and their changes written as nearly zero.
-        return Scales(found[0], *(jnp.sqrt(numbers + 1e-6) for numbers in found[1:]))
+        return Scales(mean, jnp.sqrt(variance + 1e-6), jnp.sqrt(squared_change + 1e-6))
+
+    def _kept(self, name: str, start: float, numbers: jax.Array, training: bool) -> jax.Array:
+        """f32[D] the mean of numbers f32[..., D] in training, which moves the average kept."""
+        shape = numbers.shape[-1:]
+        average = self.variable("batch_stats", name, jnp.full, shape, start, jnp.float32)
+        if not training:
+            return average.value
+        mean = jnp.mean(numbers, axis=tuple(range(numbers.ndim - 1)))
+        average.value = 0.99 * average.value + 0.01 * mean
+        return mean
 
 
 def lstm_cell(gates: jax.Array, cell: jax.Array | None) -> tuple[jax.Array, jax.Array]:

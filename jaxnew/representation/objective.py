@@ -76,7 +76,7 @@ def optimal_log_variance(target: jax.Array, mean: jax.Array, is_shared: bool) ->
     """The log-variance under which a batch is likeliest given its means: its mean squared error.
 
     The optimal sigma-VAE (Rybkin, Daniilidis, Levine, "Simple and Effective VAE Training with
-    Calibrated Decoders", ICML 2021, section 4.2). No gradient flows through it: it would be zero.
+    Calibrated Decoders", ICML 2021). No gradient flows through it: it would be zero.
     At least -12.
 
     Args:

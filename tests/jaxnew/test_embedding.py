@@ -230,6 +230,13 @@ def test_weights_of_other_files(encoder: Encoder, tmp_path: Path) -> None:
             mine.frozen()
 
 
+def test_a_flat_vae_that_draws_one_recording_of_an_action_is_frozen(tmp_path: Path) -> None:
+    few = {"model.actions_per_batch": 24, "model.recordings_per_action": 1}
+    flat = embed(LADDER, "vae", budget="smoke", set=few, runs=tmp_path)
+    data = collect(DOMAIN, tmp_path, 3).recorded
+    np.testing.assert_allclose(flat.encode(data).vectors, flat.table.vectors, atol=1e-5)
+
+
 def test_an_export_is_small_and_says_nothing_of_its_maker(encoder: Encoder, tmp_path: Path) -> None:
     exported = Encoder.load(encoder.export(tmp_path / "mine"), LADDER)
     names = ["config.json", "provenance.json", "split.json", "table.npz", "weights.npz"]
