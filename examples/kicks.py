@@ -6,7 +6,6 @@ Run it with `--task=examples.kicks:TASK`.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 
 import jax
@@ -215,8 +214,7 @@ _HVAE = RepresentationConfig(
 )
 _STAGE_ONE = StageOneBudget(
     num_recordings=64,
-    hvae=_HVAE,
-    vae=replace(_HVAE, kind="vae", actions_per_batch=150),
+    model=_HVAE,
     checkpoint_every=200,
     cost="about a minute on one core",
 )
@@ -238,8 +236,8 @@ TASK = Task(
     stage_one={
         "smoke": _STAGE_ONE.vary(
             num_recordings=8,
-            hvae__num_steps=8,
-            hvae__recordings_per_action=4,
+            model__num_steps=8,
+            model__recordings_per_action=4,
             vae__num_steps=8,
             vae__recordings_per_action=4,
             checkpoint_every=20,

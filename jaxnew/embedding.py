@@ -42,7 +42,7 @@ from jaxnew.task.task import Play, Task
 TABLE_FILE = "table.npz"
 WEIGHTS_FILE = "weights.npz"
 UNTRAINED_FILE = "untrained.npz"  # What the encoder made of actions before it was trained.
-_RECORDINGS_UNTRAINED = 16
+_RECORDINGS_UNTRAINED = 4
 SPLIT_FILE = "split.json"
 
 
@@ -343,7 +343,14 @@ def _train(
         return result.interrupted_by
     domain.split.save(directory.path / SPLIT_FILE)
     few = min(_RECORDINGS_UNTRAINED, recordings.recorded.num_recordings)
-    untrained = learner.encode(start, recordings.for_encoding(num_recordings=few))
+    # In the units of the recordings, which are no part of what is learned.
+    averages = {
+        name: result.state.batch_stats[name] for name in start.batch_stats if name == "scales"
+    }
+    untrained = learner.encode(
+        replace(start, batch_stats={**start.batch_stats, **averages}),
+        recordings.for_encoding(num_recordings=few),
+    )
     RepresentationTable(untrained, recordings.recorded.ids, source=f"untrained {name}").save(
         directory.path / UNTRAINED_FILE
     )

@@ -118,8 +118,7 @@ _HVAE = RepresentationConfig(
 )
 _STAGE_ONE = StageOneBudget(
     num_recordings=3,
-    hvae=_HVAE,
-    vae=replace(_HVAE, kind="vae", actions_per_batch=12),
+    model=_HVAE,
     checkpoint_every=2,
     cost="seconds",
 )

@@ -49,8 +49,7 @@ _HVAE = RepresentationConfig(
 )
 _SMOKE = StageOneBudget(
     num_recordings=3,
-    hvae=_HVAE,
-    vae=replace(_HVAE, kind="vae"),
+    model=_HVAE,
     checkpoint_every=1,
     cost="seconds",
 )
@@ -77,5 +76,5 @@ TASK = replace(
     toy_task.TASK,
     name="toy-video",
     plays=(STATES, VIDEO),
-    stage_one={"smoke": _SMOKE.vary(hvae__num_steps=2)},
+    stage_one={"smoke": _SMOKE.vary(model__num_steps=2)},
 )

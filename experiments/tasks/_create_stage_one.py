@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 from envs_host.create.poses import FRAMES_SHAPE, POSES_SHAPE, draw_poses
 from envs_host.create.recorder import PoolRecorder
@@ -44,35 +43,26 @@ VIDEO_HVAE = RepresentationConfig(
 )
 
 
-def _video_budget(
-    num_recordings: int, checkpoint_every: int, cost: str, **model: Any
-) -> StageOneBudget:
-    # Of images the flat VAE has the HVAE's batches.
-    hvae = replace(VIDEO_HVAE, **model)
-    vae = replace(hvae, kind="vae")
-    return StageOneBudget(num_recordings, hvae, vae, checkpoint_every, cost)
-
-
 _VIDEO_STAGE_ONE = {
-    "smoke": _video_budget(
-        2,
-        1,
-        "a minute and a half on one core, half of it for compiling",
-        num_steps=2,
-        recordings_per_action=2,
-        actions_per_batch=2,
+    "smoke": StageOneBudget(
+        num_recordings=2,
+        model=replace(VIDEO_HVAE, num_steps=2, actions_per_batch=2, recordings_per_action=2),
+        checkpoint_every=1,
+        cost="a minute and a half on one core, half of it for compiling",
     ),
-    "laptop": _video_budget(
-        24,
-        100,
-        "about 1.2 hours and 3.5 GB of memory on one core, from the rates of 3 steps and 20 tools",
-        num_steps=2000,
-        recordings_per_action=4,
-        actions_per_batch=16,
+    "laptop": StageOneBudget(
+        num_recordings=24,
+        model=replace(VIDEO_HVAE, num_steps=2000, actions_per_batch=16, recordings_per_action=4),
+        checkpoint_every=100,
+        cost="about 1.2 hours and 3.5 GB of memory on one core, from the rates of 3 steps and 20 "
+        "tools",
     ),
     # 50 s a step on one core, from the rate of `laptop`.
-    "paper": replace(
-        _video_budget(1024, 500, "nobody measured how long it takes"),
+    "paper": StageOneBudget(
+        num_recordings=1024,
+        model=VIDEO_HVAE,
+        checkpoint_every=500,
+        cost="nobody measured how long it takes",
         chunk_steps=4,
         counts_epochs=True,
     ),

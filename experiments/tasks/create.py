@@ -104,44 +104,27 @@ _STAGE_TWO = {
     "paper": _PAPER,
 }
 
-# The flat VAE draws a multiple of all train actions per step.
-_STAGE_ONE = StageOneBudget(
-    num_recordings=1024,
-    hvae=STATE_HVAE,
-    vae=replace(STATE_HVAE, kind="vae", num_steps=10_000),
-    checkpoint_every=4000,
-    cost="4 days on two cores, from the rate of `laptop`",
-    counts_epochs=True,
-)
-
-
-def _stage_one(
-    num_recordings: int, checkpoint_every: int, cost: str, **batches: int
-) -> StageOneBudget:
-    hvae = STATE_HVAE.in_minutes(**batches)
-    # The flat VAE draws a recording of every action at least.
-    vae = replace(hvae, kind="vae", actions_per_batch=2048 // hvae.recordings_per_action)
-    return StageOneBudget(num_recordings, hvae, vae, checkpoint_every, cost)
-
-
-_STAGE_ONE_BUDGETS = {
-    "smoke": _stage_one(
-        4,
-        20,
-        "half a minute, most of it for recording 2,366 tools",
-        num_steps=4,
-        actions_per_batch=8,
-        recordings_per_action=2,
+_STAGE_ONE = {
+    "smoke": StageOneBudget(
+        num_recordings=4,
+        model=STATE_HVAE.in_minutes(num_steps=4, actions_per_batch=8, recordings_per_action=2),
+        checkpoint_every=20,
+        cost="half a minute, most of it for recording 2,366 tools",
     ),
-    "laptop": _stage_one(
-        128,
-        200,
-        "3 minutes on two cores, most of it for recording",
-        num_steps=2000,
-        actions_per_batch=64,
-        recordings_per_action=4,
+    "laptop": StageOneBudget(
+        num_recordings=128,
+        model=STATE_HVAE.in_minutes(num_steps=2000, actions_per_batch=64, recordings_per_action=4),
+        checkpoint_every=200,
+        cost="3 minutes on two cores, most of it for recording",
     ),
-    "paper": _STAGE_ONE,
+    "paper": StageOneBudget(
+        num_recordings=1024,
+        model=STATE_HVAE,
+        checkpoint_every=4000,
+        cost="4 days on two cores, from the rate of `laptop`",
+        vae_steps=10_000,
+        counts_epochs=True,
+    ),
 }
 
 
@@ -274,7 +257,7 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
         environment_version=VERSION,
         environment=CreateRules(rewards=RewardConfig(with_subgoals=with_subgoals)),
         plays=_PLAYS[spacing],
-        stage_one=_STAGE_ONE_BUDGETS,
+        stage_one=_STAGE_ONE,
         stage_two=_STAGE_TWO,
         # Of the Full split alone, and only while training.
         validation_groups={} if is_analysis else {"full": attrgetter("class_labels")},

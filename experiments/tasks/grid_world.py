@@ -64,28 +64,18 @@ def _targets(universe: ActionUniverse) -> Mapping[str, np.ndarray]:
     }
 
 
-# Both stages of the paper (docs/method.md): 1,024 recordings, 672 of them a step, 40,000 steps. The
-# flat VAE draws a multiple of all train actions per step.
+# Both stages of the paper (docs/method.md): 1,024 recordings, 672 of them a step, 40,000 steps.
 _STAGE_ONE = StageOneBudget(
     num_recordings=1024,
-    hvae=RepresentationConfig(),
-    vae=RepresentationConfig(kind="vae", num_steps=10_000),
+    model=RepresentationConfig(),
     checkpoint_every=2000,
     cost="60 hours on two cores",
+    vae_steps=10_000,
     counts_epochs=True,
 )
 _STAGE_TWO = StageTwoBudget(
     num_updates=2441, final_episodes=5000, cost="about 15 minutes on two cores"
 )
-
-
-def _stage_one(
-    num_recordings: int, checkpoint_every: int, cost: str, **batches: int
-) -> StageOneBudget:
-    hvae = _STAGE_ONE.hvae.in_minutes(**batches)
-    # The flat VAE draws a recording of every action at least.
-    vae = replace(hvae, kind="vae", actions_per_batch=_STAGE_ONE.hvae.actions_per_batch)
-    return StageOneBudget(num_recordings, hvae, vae, checkpoint_every, cost)
 
 
 TASK = Task(
@@ -119,21 +109,21 @@ TASK = Task(
         ),
     ),
     stage_one={
-        "smoke": _stage_one(
-            16,
-            20,
-            "seconds",
-            num_steps=8,
-            actions_per_batch=16,
-            recordings_per_action=4,
+        "smoke": StageOneBudget(
+            num_recordings=16,
+            model=_STAGE_ONE.model.in_minutes(
+                num_steps=8, actions_per_batch=16, recordings_per_action=4
+            ),
+            checkpoint_every=20,
+            cost="seconds",
         ),
-        "laptop": _stage_one(
-            256,
-            80,
-            "about two minutes on one core",
-            num_steps=1600,
-            actions_per_batch=64,
-            recordings_per_action=8,
+        "laptop": StageOneBudget(
+            num_recordings=256,
+            model=_STAGE_ONE.model.in_minutes(
+                num_steps=1600, actions_per_batch=64, recordings_per_action=8
+            ),
+            checkpoint_every=80,
+            cost="about two minutes on one core",
         ),
         "paper": _STAGE_ONE,
     },

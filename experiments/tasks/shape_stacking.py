@@ -32,8 +32,7 @@ from jaxnew.task.places import file_of
 from jaxnew.task.presentation import Film, Filming, Measured, Presentation
 from jaxnew.task.task import Drawing, Play, Task
 
-# 60,000 steps on 32 shapes with 52 of 1,024 pictures each. Of images the flat VAE has the HVAE's
-# batches and steps.
+# 60,000 steps on 32 shapes with 52 of 1,024 pictures each.
 _HVAE = RepresentationConfig(
     encoder_width=128,
     inference_width=128,
@@ -46,30 +45,26 @@ _HVAE = RepresentationConfig(
 )
 
 
-def _stage_one(
-    hvae: RepresentationConfig, num_recordings: int, checkpoint_every: int, cost: str
-) -> StageOneBudget:
-    return StageOneBudget(
-        num_recordings, hvae, replace(hvae, kind="vae"), checkpoint_every, cost, stores_drawn=True
-    )
-
-
 _STAGE_ONE = {
-    "smoke": _stage_one(
-        _HVAE.in_minutes(num_steps=2, recordings_per_action=2, actions_per_batch=2),
-        2,
-        1,
-        "half a minute on one core, most of it for compiling",
+    "smoke": StageOneBudget(
+        num_recordings=2,
+        model=_HVAE.in_minutes(num_steps=2, actions_per_batch=2, recordings_per_action=2),
+        checkpoint_every=1,
+        cost="half a minute on one core, most of it for compiling",
+        stores_drawn=True,
     ),
-    "laptop": _stage_one(
-        _HVAE.in_minutes(num_steps=1800, recordings_per_action=4, actions_per_batch=16),
-        64,
-        100,
-        "half an hour on one core, and 1.1 GB on disk",
+    "laptop": StageOneBudget(
+        num_recordings=64,
+        model=_HVAE.in_minutes(num_steps=1800, actions_per_batch=16, recordings_per_action=4),
+        checkpoint_every=100,
+        cost="half an hour on one core, and 1.1 GB on disk",
+        stores_drawn=True,
     ),
-    "paper": replace(
-        _stage_one(_HVAE, 1024, 500, "10 days on one core, from the rate of `laptop`"),
-        stores_drawn=False,
+    "paper": StageOneBudget(
+        num_recordings=1024,
+        model=_HVAE,
+        checkpoint_every=500,
+        cost="10 days on one core, from the rate of `laptop`",
         chunk_steps=10,
         counts_epochs=True,
     ),

@@ -92,23 +92,17 @@ class Batches:
         return cls(are_pooled, config.actions_per_batch, config.recordings_per_action)
 
     def pooled_size(self, num_actions: int) -> int:
-        """Recordings of a batch from all of A actions: `A * floor(B * S / A)`."""
-        return self.actions_per_batch * self.recordings_per_action // num_actions * num_actions
+        """Recordings of a batch from all of A actions: `A * floor(B * S / A)`, and A at least."""
+        asked_for = self.actions_per_batch * self.recordings_per_action
+        return max(1, asked_for // num_actions) * num_actions
 
     def check(self, num_actions: int, num_recordings: int) -> None:
         """Raises unless batches can be drawn from `num_recordings` of each of `num_actions`.
 
         Raises:
-          ValueError: there are too few actions or recordings, or pooled batches are too small.
+          ValueError: there are too few actions or recordings.
         """
         if self.are_pooled:
-            if self.pooled_size(num_actions) < 1:
-                raise ValueError(
-                    f"actions_per_batch * recordings_per_action = "
-                    f"{self.actions_per_batch * self.recordings_per_action} is less than the "
-                    f"{num_actions} train actions; the flat VAE needs at least one recording per "
-                    "action and step. Raise either field."
-                )
             return
         if num_actions < self.actions_per_batch:
             raise ValueError(

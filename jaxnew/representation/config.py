@@ -23,23 +23,20 @@ class RepresentationConfig:
       observation_latent: dz, size of a recording's latent; of the representation for the flat VAE.
       actions_per_batch: B, train actions per gradient step.
       recordings_per_action: S, recordings of each per gradient step. The flat VAE draws
-        `A_train * floor(B * S / A_train)` recordings instead.
+        `A_train * max(1, floor(B * S / A_train))` recordings instead.
       num_steps: gradient steps of the whole training. The flat VAE's reference is 10,000.
       learning_rate: of RAdam.
       gradient_clip: every gradient entry is clamped to +- this.
-      decays_learning_rate: constant for half of the steps, then linearly to a hundredth; False:
-        constant.
       has_optimal_variance: the Gaussian likelihood has the variance that fits the batch's errors
         best, see `objective.optimal_log_variance`; False: one that is learned.
-      normalizes_log_variance: the log-variance of q(c | O) passes through the scalar batch norm
-        together with the mean; False: as the network gives it (HVAE only).
       kl_recordings: n, the action's divergence counts 1/n per recording, as if each action had n
         recordings in the batch; None: as many as it has (HVAE only).
       standardizes: encoder and decoder read and write vectors in units of their mean, deviation and
-        step size, see `encoders.Scales`, and the decoder's images start as their mean colour;
-        False: as they are.
-      predicts_changes: the decoder adds what it gives to the last step; False: it gives the step.
-      reads_changes: the encoder reads how far each step is from the one before, too.
+        step size, see `encoders.Scales`; the decoder reads back probabilities of categories, and
+        its images start as their mean colour. False: as they are.
+      predicts_changes: the decoder adds what it gives to the last step, of a video to the last
+        frame's code, and starts from the first frame; False: it gives the step.
+      reads_changes: the encoder reads how far each step, or pixel, is from the one before, too.
 
     Raises:
       TypeError: a count is not an integer.
@@ -57,9 +54,7 @@ class RepresentationConfig:
     num_steps: int = 40_000
     learning_rate: float = 1e-3
     gradient_clip: float = 0.5
-    decays_learning_rate: bool = False
     has_optimal_variance: bool = False
-    normalizes_log_variance: bool = True
     kl_recordings: int | None = None
     standardizes: bool = False
     predicts_changes: bool = False

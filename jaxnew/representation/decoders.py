@@ -41,18 +41,20 @@ class DecoderStart(nn.Module):
 class TrajectoryDecoder(nn.Module):
     """Predicts steps 1..T-1 of a recording from its step 0, feeding back its own predictions.
 
-    For one-hot features the predictions are raw logits, and raw
-    logits are fed back.
+    Of one-hot features the predictions are logits.
 
     Attributes:
       width: H.
       pytorch_init: see `Dense`.
       predicts_changes: see `RepresentationConfig`.
+      num_categories: K, where features are one-hot blocks of K numbers and the probabilities of
+        what was predicted are fed back; 0: what was predicted, of one-hot features their logits.
     """
 
     width: int
     pytorch_init: bool = False
     predicts_changes: bool = False
+    num_categories: int = 0
 
     @nn.compact
     def __call__(
@@ -83,13 +85,19 @@ class TrajectoryDecoder(nn.Module):
                 return last + scales.change * written
             return scales.mean + scales.deviation * written
 
+        def seen(prediction: jax.Array) -> jax.Array:
+            if not self.num_categories:
+                return scales.standardized(prediction)
+            blocks = prediction.reshape(-1, self.num_categories, prediction.shape[-1])
+            return nn.softmax(blocks, axis=1).reshape(prediction.shape)
+
         g = g.reshape(self.width, -1)
         step = first_step.reshape(-1, dim).T
         gates = kernel_input.T @ (g * before(read(scales.standardized(step))))
         hidden, cell = lstm_cell(gates + bias[:, None], None)
         predictions = [predicted(hidden, step)]
         for _ in range(num_steps - 2):
-            u = g * before(read(scales.standardized(predictions[-1])))
+            u = g * before(read(seen(predictions[-1])))
             gates = kernel @ jnp.concatenate([u, hidden]) + bias[:, None]
             hidden, cell = lstm_cell(gates, cell)
             predictions.append(predicted(hidden, predictions[-1]))

@@ -11,21 +11,8 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew.representation.decoders import DecoderStart
-from jaxnew.representation.encoders import (
-    Dense,
-    LatentHead,
-    ResBlock,
-    ScalarBatchNorm,
-    Standardization,
-    likelihood_log_variance,
-)
-from jaxnew.representation.images import (
-    decoded,
-    encoded,
-    recording_decoder,
-    recording_encoder,
-)
+from jaxnew.representation.autoencoder import Autoencoder
+from jaxnew.representation.encoders import Dense, LatentHead, ResBlock, ScalarBatchNorm
 from jaxnew.representation.objective import LatentNoise, VAEOutput, sample_gaussian
 
 
@@ -35,12 +22,10 @@ class ActionInference(nn.Module):
     Attributes:
       width: Ho.
       latent: dc.
-      normalizes_log_variance: see `RepresentationConfig`.
     """
 
     width: int
     latent: int
-    normalizes_log_variance: bool = True
 
     @nn.compact
     def __call__(self, h: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
@@ -49,11 +34,7 @@ class ActionInference(nn.Module):
         # The release has Lin, then the mean over S. The two commute; this order is cheaper.
         e = Dense(self.width)(jnp.mean(e, axis=-1))
         e = Dense(2 * self.latent)(ResBlock(3)(e))
-        normalize = ScalarBatchNorm()
-        if not self.normalizes_log_variance:
-            mean, log_variance = jnp.split(e, 2)
-            return normalize(mean, training), log_variance
-        mean, log_variance = jnp.split(normalize(e, training), 2)
+        mean, log_variance = jnp.split(ScalarBatchNorm()(e, training), 2)
         return mean, log_variance
 
 
@@ -95,53 +76,17 @@ class LatentPrior(nn.Module):
         return LatentHead(self.latent)(e, training)
 
 
-class HVAE(nn.Module):
-    """The hierarchical VAE for trajectories, videos and still images.
-
-    Attributes:
-      encoder_width: E.
-      inference_width: Ho.
-      hidden_width: H.
-      action_latent: dc.
-      observation_latent: dz.
-      gaussian_dim: D for a Gaussian likelihood, whose log-variance is a free vector of that length;
-        0 for one without: a categorical one, or where it is that of the batch's errors.
-      image_shape: (side, side, channels) where a step of a recording is an image, else None.
-      is_still: whether a recording is one image.
-      normalizes_log_variance, standardizes, predicts_changes, reads_changes: see
-        `RepresentationConfig`. Of videos, changes are those of the frames' codes.
-    """
-
-    encoder_width: int
-    inference_width: int
-    hidden_width: int
-    action_latent: int
-    observation_latent: int
-    gaussian_dim: int
-    image_shape: tuple[int, int, int] | None = None
-    is_still: bool = False
-    normalizes_log_variance: bool = True
-    standardizes: bool = False
-    predicts_changes: bool = False
-    reads_changes: bool = False
+class HVAE(Autoencoder):
+    """The hierarchical VAE."""
 
     def setup(self) -> None:
-        reads_changes = self.reads_changes and not self.is_still
-        self.encoder = recording_encoder(self.encoder_width, self.image_shape, reads_changes)
-        num_channels = None if self.image_shape is None else self.image_shape[-1]
-        self.scales = Standardization(self.standardizes, num_channels)
+        super().setup()
+        width, latent = self.config.hidden_width, self.config.observation_latent
         self.action_inference = ActionInference(
-            self.inference_width, self.action_latent, self.normalizes_log_variance
+            self.config.inference_width, self.config.action_latent
         )
-        self.observation_inference = ObservationInference(
-            self.hidden_width, self.observation_latent
-        )
-        self.latent_prior = LatentPrior(self.hidden_width, self.observation_latent)
-        self.decoder_start = DecoderStart(self.hidden_width)
-        self.decoder = recording_decoder(
-            self.hidden_width, self.image_shape, self.is_still, self.predicts_changes
-        )
-        self.likelihood_log_variance = likelihood_log_variance(self, self.gaussian_dim)
+        self.observation_inference = ObservationInference(width, latent)
+        self.latent_prior = LatentPrior(width, latent)
 
     def __call__(self, features: jax.Array, noise: LatentNoise, training: bool) -> VAEOutput:
         """One pass through inference, prior and decoder.
@@ -151,16 +96,15 @@ class HVAE(nn.Module):
           noise: of the two sampled latents.
           training: True normalises with batch statistics and updates the running averages.
         """
-        scales = self.scales(features, training)
-        h, start = encoded(self.encoder, features, scales, training)
-        action_mean, action_log_variance = self.action_inference(h, training)
+        read = self.read(features, training)
+        action_mean, action_log_variance = self.action_inference(read.hidden, training)
         c = sample_gaussian(action_mean, action_log_variance, noise.action.T)
-        z_mean, z_log_variance = self.observation_inference(h, c, training)
+        z_mean, z_log_variance = self.observation_inference(read.hidden, c, training)
         z_noise = jnp.moveaxis(noise.observation, -1, 0)
         z = sample_gaussian(z_mean, z_log_variance[:, None, None], z_noise)
         prior_mean, prior_log_variance = self.latent_prior(c, training)
         g = self.decoder_start(z, c)
-        prediction = decoded(self.decoder, g, start, features, scales, training)
+        prediction = self.write(g, read, features, training)
         return VAEOutput(
             action_mean=action_mean.T,
             action_log_variance=action_log_variance.T,
@@ -174,6 +118,5 @@ class HVAE(nn.Module):
 
     def posterior(self, features: jax.Array) -> tuple[jax.Array, jax.Array]:
         """`q(c | O)` with running averages: f32[B, S, T, D] -> (mean, log-variance) f32[B, dc]."""
-        h, _ = encoded(self.encoder, features, self.scales(features, False), False)
-        mean, log_variance = self.action_inference(h, False)
+        mean, log_variance = self.action_inference(self.read(features, False).hidden, False)
         return mean.T, log_variance.T

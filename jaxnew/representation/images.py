@@ -19,7 +19,7 @@ import jax
 import jax.numpy as jnp
 from flax import linen as nn
 
-from jaxnew.convolution import WINDOW, convolution
+from jaxnew.convolution import WINDOW, convolution_by_xla
 from jaxnew.representation.decoders import TrajectoryDecoder
 from jaxnew.representation.encoders import (
     Dense,
@@ -36,6 +36,10 @@ ENCODERS = {
     48: ((8, 8, 16, 16, 16, 16, 32), (2, 1, 2, 1, 2, 1, 2)),
     84: ((8, 8, 16, 16, 16, 16, 32, 32, 32), (2, 1, 2, 1, 2, 1, 2, 1, 2)),
 }
+
+
+# Logit of the mask of a video that is drawn as its changes: at first all of it stands still.
+MASK_START = -4.0
 
 
 class _Upsampling(NamedTuple):
@@ -119,7 +123,8 @@ class Convolution(nn.Module):
         """f32[B, H, W, C] -> f32[B, H', W', O]."""
         init = uniform_within(1.0 / math.sqrt(WINDOW**2 * x.shape[-1]))
         kernel = self.param("kernel", init, (WINDOW, WINDOW, x.shape[-1], self.features))
-        return convolution(x, kernel, self.stride) + self.param("bias", init, (self.features,))
+        y = convolution_by_xla(x, kernel, self.stride)  # Steps on images are no part of a loop.
+        return y + self.param("bias", init, (self.features,))
 
 
 class TransposedConvolution(nn.Module):
@@ -172,9 +177,11 @@ class FrameDecoder(nn.Module):
 
     Attributes:
       image_shape: (side, side, C).
+      predicts_changes: see `RepresentationConfig`; masks then start from `MASK_START`.
     """
 
     image_shape: tuple[int, int, int]
+    predicts_changes: bool = False
 
     @nn.compact
     def __call__(
@@ -194,7 +201,7 @@ class FrameDecoder(nn.Module):
         init = uniform_within(1.0 / math.sqrt(x.shape[-1]))
         out = nn.Dense(self.image_shape[2] + 1, kernel_init=init, bias_init=init, name="pixels")(x)
         image = nn.sigmoid(out[..., :-1] + _logit(mean))
-        return image - 0.5, nn.sigmoid(out[..., -1:])
+        return image - 0.5, nn.sigmoid(out[..., -1:] + MASK_START * self.predicts_changes)
 
 
 def _logit(mean: jax.Array | float) -> jax.Array:
@@ -219,10 +226,13 @@ class ImageRecordingEncoder(nn.Module):
     @nn.compact
     def __call__(self, features: jax.Array, training: bool) -> tuple[jax.Array, jax.Array]:
         """f32[B, S, T, side * side * C] -> (f32[E, B, S], first frames' codes f32[B, S, 288])."""
-        codes = FrameEncoder()(features.reshape(-1, *self.image_shape), training)
+        frames = features.reshape(*features.shape[:-1], *self.image_shape)
+        if self.reads_changes:
+            changes = jnp.diff(frames, axis=2, prepend=frames[:, :, :1])
+            frames = jnp.concatenate([frames, changes], axis=-1)
+        codes = FrameEncoder()(frames.reshape(-1, *frames.shape[3:]), training)
         codes = codes.reshape(*features.shape[:-1], CODE_SIZE)
-        trajectory = TrajectoryEncoder(self.width, self.reads_changes, name="trajectory")
-        return trajectory(codes), codes[:, :, 0]
+        return TrajectoryEncoder(self.width, name="trajectory")(codes), codes[:, :, 0]
 
 
 class ImageRecordingDecoder(nn.Module):
@@ -263,7 +273,7 @@ class ImageRecordingDecoder(nn.Module):
         Returns:
           Means f32[B, S, T - 1, side * side * C] of the later frames, or [B, S, 1, ...] of a still.
         """
-        decoder = FrameDecoder(self.image_shape)
+        decoder = FrameDecoder(self.image_shape, self.predicts_changes)
         batch = features.shape[:2]
         if self.is_still:
             hidden = ResBlock(2, self.pytorch_init)(g)
@@ -280,50 +290,3 @@ class ImageRecordingDecoder(nn.Module):
             image, mask = decoder(codes[:, :, t].reshape(-1, CODE_SIZE), scales.mean, training)
             means.append((mask * image + (1.0 - mask) * first).reshape(*batch, -1))
         return jnp.stack(means, axis=2)
-
-
-def recording_encoder(
-    width: int, image_shape: tuple[int, int, int] | None, reads_changes: bool
-) -> nn.Module:
-    """The encoder of trajectories, or of images of a shape; called by `encoded`."""
-    if image_shape is None:
-        return TrajectoryEncoder(width, reads_changes)
-    return ImageRecordingEncoder(width, image_shape, reads_changes)
-
-
-def recording_decoder(
-    width: int,
-    image_shape: tuple[int, int, int] | None,
-    is_still: bool,
-    predicts_changes: bool,
-    pytorch_init: bool = False,
-) -> nn.Module:
-    """The decoder of trajectories, or of images of a shape; called by `decoded`."""
-    if image_shape is None:
-        return TrajectoryDecoder(width, pytorch_init, predicts_changes)
-    return ImageRecordingDecoder(width, image_shape, is_still, predicts_changes, pytorch_init)
-
-
-def encoded(
-    encoder: nn.Module, features: jax.Array, scales: Scales, training: bool
-) -> tuple[jax.Array, jax.Array]:
-    """Recordings f32[B, S, T, D] -> (f32[E, B, S], what the decoder starts from f32[B, S, D'])."""
-    if isinstance(encoder, TrajectoryEncoder):
-        return encoder(features, scales), features[:, :, 0]
-    both: tuple[jax.Array, jax.Array] = encoder(features, training)
-    return both
-
-
-def decoded(
-    decoder: nn.Module,
-    g: jax.Array,
-    start: jax.Array,
-    features: jax.Array,
-    scales: Scales,
-    training: bool,
-) -> jax.Array:
-    """Means of the scored steps, from g f32[H, B, S] and what `encoded` gave to start from."""
-    if isinstance(decoder, TrajectoryDecoder):
-        return decoder(g, start, features.shape[2], scales)
-    means: jax.Array = decoder(g, start, features, scales, training)
-    return means

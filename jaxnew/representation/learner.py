@@ -93,7 +93,7 @@ class RepresentationLearner:
         # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
         self._optimizer = in_32_bits(
             optax.chain(
-                optax.clip(config.gradient_clip), optax.radam(_learning_rate(config), threshold=5.0)
+                optax.clip(config.gradient_clip), optax.radam(config.learning_rate, threshold=5.0)
             )
         )
         self._run = jax.jit(self._run_steps)
@@ -366,16 +366,6 @@ class RepresentationLearner:
             variables, self._features(recordings), method="posterior"
         )
         return posterior
-
-
-def _learning_rate(config: RepresentationConfig) -> float | optax.Schedule:
-    """The learning rate, or that of each step."""
-    if not config.decays_learning_rate:
-        return config.learning_rate
-    half = config.num_steps // 2
-    return optax.linear_schedule(
-        config.learning_rate, config.learning_rate / 100, config.num_steps - half, half
-    )
 
 
 def _added(totals: Metrics, metrics: Metrics) -> Metrics:

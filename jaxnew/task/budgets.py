@@ -20,9 +20,10 @@ class StageOneBudget:
 
     Attributes:
       num_recordings: recordings per action to collect.
-      hvae, vae: hyper-parameters by kind.
+      model: hyper-parameters, whose kind is asked for by name.
       checkpoint_every: gradient steps between checkpoints, which are five minutes apart at most.
       cost: what it takes; shown before it starts.
+      vae_steps: gradient steps of the flat VAE; None: those of the HVAE.
       stores_drawn: recordings of a play with a drawing are drawn once and stored; else they are
         drawn for each batch. The numbers are the same.
       chunk_steps: gradient steps per compiled call; a kill loses as many at least, so that they
@@ -32,16 +33,16 @@ class StageOneBudget:
     """
 
     num_recordings: int
-    hvae: RepresentationConfig
-    vae: RepresentationConfig
+    model: RepresentationConfig
     checkpoint_every: int
     cost: str
+    vae_steps: int | None = None
     stores_drawn: bool = False
     chunk_steps: int = 20
     counts_epochs: bool = False
 
     def vary(self, **changes: Any) -> StageOneBudget:
-        """A budget that differs in some fields; `hvae__num_steps` is a field of a group.
+        """A budget that differs in some fields; `model__num_steps` is a field of a group.
 
         Raises:
           ConfigError: there is no such field, or it takes no such value.
@@ -56,7 +57,9 @@ class StageOneBudget:
           num_actions: that it is trained on.
           num_default: that those of the default split are trained on.
         """
-        config = self.hvae if kind == "hvae" else self.vae
+        config = replace(self.model, kind=kind)
+        if kind == "vae" and self.vae_steps is not None:
+            config = replace(config, num_steps=self.vae_steps)
         if not self.counts_epochs:
             return config
         per_pass, usually = (n // config.actions_per_batch for n in (num_actions, num_default))

@@ -14,7 +14,7 @@ def test_the_papers_encoder() -> None:
     budget = TASK.stage_one["paper"]
     assert (budget.num_recordings, budget.counts_epochs) == (1024, True)
     for kind in ("hvae", "vae"):
-        config = getattr(budget, kind)
+        config = budget.config(kind, 405, 405)
         assert (config.actions_per_batch, config.recordings_per_action) == (32, 52)
         assert (config.action_latent, config.observation_latent) == (128, 128)
         widths = config.encoder_width, config.inference_width, config.hidden_width
@@ -24,7 +24,7 @@ def test_the_papers_encoder() -> None:
         assert budget.config(kind, 420, 405).num_steps == 65_000
         assert budget.config(kind, 810, 405).num_steps == 125_000
     laptop = TASK.stage_one["laptop"]
-    assert laptop.config("hvae", 810, 405) == laptop.hvae
+    assert laptop.config("hvae", 810, 405) == laptop.model
 
 
 @pytest.mark.golden

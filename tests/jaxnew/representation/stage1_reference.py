@@ -121,13 +121,22 @@ def reading(x, scales, reads_changes):
     return np.array(rows)
 
 
-def decode(p, g, first_step, num_steps, scales=(0.0, 1.0, 1.0), predicts_changes=False):
-    """g [H], first_step [D] of one recording -> [T-1, D]."""
+def decode(
+    p, g, first_step, num_steps, scales=(0.0, 1.0, 1.0), predicts_changes=False, num_categories=0
+):
+    """g [H], first_step [D] of one recording -> [T-1, D].
+
+    `num_categories`: of one-hot blocks whose probabilities are fed back.
+    """
     mean, deviation, change = scales
     state = np.zeros(g.shape), np.zeros(g.shape)
     step, out = first_step, []
-    for _ in range(num_steps - 1):
-        u = res_block(p["before_lstm"], dense(p["read"], (step - mean) / deviation))
+    for t in range(num_steps - 1):
+        seen = (step - mean) / deviation
+        if num_categories and t:
+            odds = np.exp(seen.reshape(-1, num_categories))
+            seen = (odds / odds.sum(axis=1, keepdims=True)).ravel()
+        u = res_block(p["before_lstm"], dense(p["read"], seen))
         state = lstm_step(p["lstm"], g * u, *state)
         written = dense(p["write"], res_block(p["after_lstm"], state[0]))
         step = step + change * written if predicts_changes else mean + deviation * written
@@ -170,7 +179,8 @@ def hvae(p, x, action_noise, observation_noise, num_categories=0, is_changed=Fal
     """
     p, x = as_float64(p), np.asarray(x, np.float64)
     num_actions, num_recordings, num_steps, dim = x.shape
-    scales = scales_of(x) if is_changed else (0.0, 1.0, 1.0)
+    scales = scales_of(x) if is_changed and not num_categories else (0.0, 1.0, 1.0)
+    fed_back = num_categories if is_changed else 0
     h = np.array(
         [
             [encode_recording(p["encoder"], reading(one, scales, is_changed)) for one in rows]
@@ -179,13 +189,8 @@ def hvae(p, x, action_noise, observation_noise, num_categories=0, is_changed=Fal
     )
 
     q = p["action_inference"]
-    statistics = action_statistics(q, h)
-    if is_changed:
-        mean, log_variance = np.split(statistics, 2, axis=1)
-        mean = scalar_batch_norm(q["ScalarBatchNorm_0"], mean)
-    else:
-        statistics = scalar_batch_norm(q["ScalarBatchNorm_0"], statistics)
-        mean, log_variance = np.split(statistics, 2, axis=1)
+    statistics = scalar_batch_norm(q["ScalarBatchNorm_0"], action_statistics(q, h))
+    mean, log_variance = np.split(statistics, 2, axis=1)
     c = mean + np.exp(log_variance / 2) * action_noise
 
     q = p["observation_inference"]
@@ -203,8 +208,10 @@ def hvae(p, x, action_noise, observation_noise, num_categories=0, is_changed=Fal
     predicted = np.zeros((num_actions, num_recordings, num_steps - 1, dim))
     for b, s in np.ndindex(num_actions, num_recordings):
         g = relu(dense(q["from_observation"], z[b, s]) + dense(q["from_action"], c[b]))
-        predicted[b, s] = decode(p["decoder"], g, x[b, s, 0], num_steps, scales, is_changed)
-    if is_changed:
+        predicted[b, s] = decode(
+            p["decoder"], g, x[b, s, 0], num_steps, scales, is_changed, fed_back
+        )
+    if is_changed and not num_categories:
         likelihood = np.log(((x[:, :, 1:] - predicted) ** 2).reshape(-1, dim).mean(axis=0))
     elif not num_categories:
         likelihood = learned_log_variance(p)

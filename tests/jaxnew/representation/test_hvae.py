@@ -10,8 +10,10 @@ import pytest
 import stage1_reference as reference
 
 from jaxnew.representation import decoders, encoders, objective
-from jaxnew.representation.hvae import HVAE, ActionInference
-from jaxnew.representation.vae import FlatVAE
+from jaxnew.representation.config import RepresentationConfig
+from jaxnew.representation.hvae import ActionInference
+from jaxnew.representation.modality import one_hot_modality, vector_modality
+from jaxnew.representation.vae import build_model
 
 # float32 against float64 through some ten layers of width < 130.
 RTOL, ATOL = 2e-4, 2e-5
@@ -85,17 +87,21 @@ def test_still_images_are_sequences_of_length_one():
 
 
 @pytest.mark.oracle
-def test_decoder_feeds_back_its_own_predictions():
+@pytest.mark.parametrize("num_categories", [0, 2])
+def test_decoder_feeds_back_its_own_predictions(num_categories):
     rng = np.random.default_rng(2)
     g = rng.normal(size=(16, 2, 3)).astype(np.float32)
     first = rng.normal(size=(2, 3, 4)).astype(np.float32)
-    module = decoders.TrajectoryDecoder(16)  # Wide enough that not all ReLUs are off.
+    # Wide enough that not all ReLUs are off.
+    module = decoders.TrajectoryDecoder(16, num_categories=num_categories)
     variables = random_variables(module, g, first, 5)
     plain = reference.as_float64(variables["params"])
     ours = jax.jit(lambda v: module.apply(v, g, first, 5))(variables)
     assert ours.shape == (2, 3, 4, 4)
     for b, s in np.ndindex(2, 3):
-        expected = reference.decode(plain, g[:, b, s], first[b, s], 5)
+        expected = reference.decode(
+            plain, g[:, b, s], first[b, s], 5, num_categories=num_categories
+        )
         np.testing.assert_allclose(ours[b, s], expected, rtol=RTOL, atol=ATOL)
 
 
@@ -132,15 +138,10 @@ def test_action_inference_averages_after_its_last_layer_as_in_the_release():
     np.testing.assert_allclose(log_variance.T, statistics[:, 2:], rtol=RTOL, atol=ATOL)
 
 
-def small_hvae(gaussian_dim):
-    return HVAE(
-        encoder_width=5,
-        inference_width=14,
-        hidden_width=12,
-        action_latent=3,
-        observation_latent=2,
-        gaussian_dim=gaussian_dim,
-    )
+SMALL = RepresentationConfig(
+    encoder_width=5, inference_width=14, hidden_width=12, action_latent=3, observation_latent=2
+)
+XY = vector_modality("xy", 2)
 
 
 def noise(seed, num_actions, num_recordings, action_latent=3, observation_latent=2):
@@ -162,7 +163,7 @@ def test_the_whole_hvae_equals_numpy(num_categories):
     else:
         features = rng.uniform(0, 9, (3, 4, 3, 2))
     features = features.astype(np.float32)
-    model = small_hvae(0 if num_categories else 2)
+    model = build_model(SMALL, one_hot_modality("cells", 2, 4) if num_categories else XY)
     draws = noise(6, 3, 4)
     variables = random_variables(model, features, draws, False)
     output, _ = apply_in_training(model, variables, features, draws)
@@ -179,13 +180,7 @@ def test_the_whole_hvae_of_changes_equals_numpy():
     """All that is not the paper's at once: units, changes, variances, the weight of the KL."""
     features = np.random.default_rng(15).uniform(0, 9, (3, 4, 4, 2)).astype(np.float32)
     features[..., 1] *= 0.01  # In another unit.
-    model = replace(
-        small_hvae(0),
-        normalizes_log_variance=False,
-        standardizes=True,
-        predicts_changes=True,
-        reads_changes=True,
-    )
+    model = build_model(SMALL.in_minutes(), XY)
     draws = noise(16, 3, 4)
     variables = random_variables(model, features, draws, False)
     output, updated = apply_in_training(model, variables, features, draws)
@@ -203,10 +198,28 @@ def test_the_whole_hvae_of_changes_equals_numpy():
         np.testing.assert_allclose(after, 0.99 * before + 0.01 * value, rtol=1e-4)
 
 
+@pytest.mark.oracle
+def test_the_whole_hvae_of_one_hot_changes_equals_numpy():
+    """Categories have no units: probabilities are fed back, and logits are added to."""
+    rng = np.random.default_rng(5)
+    features = np.eye(4)[rng.integers(0, 4, (3, 4, 3, 2))].reshape(3, 4, 3, 8).astype(np.float32)
+    model = build_model(SMALL.in_minutes(), one_hot_modality("cells", 2, 4))
+    draws = noise(6, 3, 4)
+    variables = random_variables(model, features, draws, False)
+    assert "scales" not in variables["batch_stats"]
+    output, _ = apply_in_training(model, variables, features, draws)
+    terms = objective.elbo_terms(output, features, 4)
+    expected = reference.hvae(
+        variables["params"], features, draws.action, draws.observation, 4, is_changed=True
+    )
+    ours = (terms.reconstruction, terms.kl_action, terms.kl_observation)
+    np.testing.assert_allclose(ours, expected, rtol=2e-3)
+
+
 @pytest.mark.unit
 def test_learned_log_variances_beyond_their_bounds_get_no_gradient():
     features = np.random.default_rng(17).uniform(0, 9, (2, 3, 3, 2)).astype(np.float32)
-    model, draws = small_hvae(2), noise(18, 2, 3)
+    model, draws = build_model(SMALL, XY), noise(18, 2, 3)
     variables = random_variables(model, features, draws, False)
 
     def loss(log_variance):
@@ -223,7 +236,7 @@ def test_learned_log_variances_beyond_their_bounds_get_no_gradient():
 @pytest.mark.oracle
 def test_the_whole_flat_vae_equals_numpy():
     features = np.random.default_rng(7).uniform(0, 9, (1, 6, 3, 2)).astype(np.float32)
-    model = FlatVAE(encoder_width=5, hidden_width=12, observation_latent=2, gaussian_dim=2)
+    model = build_model(replace(SMALL, kind="vae"), XY)
     draws = noise(8, 1, 6)
     variables = random_variables(model, features, draws, False)
     output, _ = apply_in_training(model, variables, features, draws)
@@ -234,11 +247,11 @@ def test_the_whole_flat_vae_equals_numpy():
     assert float(terms.kl_action) == 0.0
 
 
-def count(model, dim, num_steps=3):
-    features = jax.ShapeDtypeStruct((2, 2, num_steps, dim), jnp.float32)
-    latents = objective.draw_noise(
-        jax.random.key(0), (2, 2), model.action_latent, model.observation_latent
-    )
+def count(config, modality, num_steps=3):
+    features = jax.ShapeDtypeStruct((2, 2, num_steps, modality.feature_dim), jnp.float32)
+    sizes = config.action_latent, config.observation_latent
+    latents = objective.draw_noise(jax.random.key(0), (2, 2), *sizes)
+    model = build_model(config, modality)
     shapes = jax.eval_shape(lambda x: model.init(jax.random.key(0), x, latents, False), features)
     return sum(leaf.size for leaf in jax.tree.leaves(shapes["params"]))
 
@@ -250,15 +263,9 @@ def test_parameter_counts_are_the_releases_without_its_unused_layers():
     # 16 * 64 + 64 = 1,088 each; in one-hot also the free log-variance of 160 features, which a
     # categorical likelihood does not read.
     unused = 2 * (16 * 64 + 64)
-    sizes = {
-        "encoder_width": 64,
-        "inference_width": 128,
-        "hidden_width": 64,
-        "action_latent": 16,
-        "observation_latent": 16,
-    }
-    assert count(HVAE(**sizes, gaussian_dim=2), 2) == 341_994 - unused
-    assert count(HVAE(**sizes, gaussian_dim=0), 160) == 443_430 - unused - 160
+    config = RepresentationConfig()
+    assert count(config, XY) == 341_994 - unused
+    assert count(config, one_hot_modality("cells", 2, 80)) == 443_430 - unused - 160
     # CREATE's state modality: D = 6, T = 7, latents of 128, same two layers unused.
-    sizes |= {"action_latent": 128, "observation_latent": 128}
-    assert count(HVAE(**sizes, gaussian_dim=6), 6) == 431_250 - 2 * (128 * 64 + 64)
+    config = replace(config, action_latent=128, observation_latent=128)
+    assert count(config, vector_modality("state", 6)) == 431_250 - 2 * (128 * 64 + 64)

@@ -9,16 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import stage1_reference as reference
-from test_hvae import random_variables
+from test_hvae import count, random_variables
 
 from jaxnew.finiteness import cause_of
 from jaxnew.representation import images, objective
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.encoders import AS_GIVEN
-from jaxnew.representation.hvae import HVAE
 from jaxnew.representation.learner import RepresentationLearner
 from jaxnew.representation.modality import Modality, image_modality
-from jaxnew.representation.vae import FlatVAE
+from jaxnew.representation.vae import build_model
 
 # float32 against float64 through some twenty layers, each normalised by the batch.
 TOLERANCE = {"rtol": 2e-3, "atol": 2e-3}
@@ -169,19 +168,6 @@ def test_the_encoder_reads_every_frame_and_hands_on_the_first():
     np.testing.assert_allclose(changed[:, 0, 1], h[:, 0, 1], atol=1e-6)
 
 
-def count(model, num_steps):
-    features = jax.ShapeDtypeStruct((2, 2, num_steps, model.gaussian_dim), jnp.float32)
-    action_latent = getattr(model, "action_latent", 1)
-
-    def init(x):
-        draws = objective.draw_noise(
-            jax.random.key(0), (2, 2), action_latent, model.observation_latent
-        )
-        return model.init(jax.random.key(0), x, draws, False)["params"]
-
-    return sum(leaf.size for leaf in jax.tree.leaves(jax.eval_shape(init, features)))
-
-
 @pytest.mark.golden
 def test_parameter_counts_are_the_specs_without_its_unused_layers():
     # The release has 1,583,280 (video) and 1,429,938 (still images), unused layers included. These
@@ -189,21 +175,20 @@ def test_parameter_counts_are_the_specs_without_its_unused_layers():
     # 128 * 128 + 128 each, and the log-variance of the 288 numbers that the LSTM or MLP decoder
     # predicts, which is discarded.
     unused = 2 * (128 * 128 + 128) + 288
-    sizes = {
-        "encoder_width": 128,
-        "inference_width": 128,
-        "hidden_width": 128,
-        "action_latent": 128,
-        "observation_latent": 128,
-    }
-    video = HVAE(**sizes, gaussian_dim=48 * 48, image_shape=VIDEO)
-    still = HVAE(**sizes, gaussian_dim=84 * 84 * 3, image_shape=STILL, is_still=True)
-    assert count(video, 7) == 1_583_280 - unused == 1_549_968
-    assert count(still, 1) == 1_429_938 - unused == 1_396_626
-    # Changes of codes are read by both directions of the LSTM; a still image has none.
-    changes = {"reads_changes": True, "predicts_changes": True, "standardizes": True}
-    assert count(replace(video, **changes), 7) == 1_549_968 + 2 * 288 * 4 * 128
-    assert count(replace(still, **changes), 1) == 1_396_626
+    config = RepresentationConfig(
+        encoder_width=128,
+        inference_width=128,
+        hidden_width=128,
+        action_latent=128,
+        observation_latent=128,
+    )
+    video, still = image_modality("video", VIDEO), image_modality("still", STILL, is_still=True)
+    assert count(config, video, 7) == 1_583_280 - unused == 1_549_968
+    assert count(config, still, 1) == 1_429_938 - unused == 1_396_626
+    # Without the pixels' log-variances; changes of pixels are a channel more for 8 windows.
+    config = config.in_minutes()
+    assert count(config, video, 7) == 1_549_968 - 48 * 48 + 9 * 8
+    assert count(config, still, 1) == 1_396_626 - 84 * 84 * 3
 
 
 @pytest.mark.unit
@@ -212,13 +197,15 @@ def test_both_vaes_take_both_kinds_of_images(is_flat):
     """Shapes of a whole pass, traced; pixels have a log-variance each."""
     for shape, num_steps, is_still in ((VIDEO, 4, False), (STILL, 1, True)):
         size = int(np.prod(shape))
-        common = {"observation_latent": 3, "gaussian_dim": size, "image_shape": shape}
-        widths = {"encoder_width": 6, "hidden_width": 5, "is_still": is_still}
-        model = (
-            FlatVAE(**widths, **common)
-            if is_flat
-            else HVAE(**widths, **common, inference_width=4, action_latent=2)
+        config = RepresentationConfig(
+            kind="vae" if is_flat else "hvae",
+            encoder_width=6,
+            inference_width=4,
+            hidden_width=5,
+            action_latent=2,
+            observation_latent=3,
         )
+        model = build_model(config, image_modality("any", shape, is_still))
         draws = objective.LatentNoise(jnp.zeros((2, 2)), jnp.zeros((2, 3, 3)))
         features = jnp.zeros((2, 3, num_steps, size))
 

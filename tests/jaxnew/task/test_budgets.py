@@ -26,7 +26,7 @@ def test_a_budget_differs_in_what_is_said() -> None:
         cost="more",
     )
     assert TWO.vary() == TWO
-    assert ONE.vary(hvae__num_steps=7).hvae == replace(ONE.hvae, num_steps=7)
+    assert ONE.vary(model__num_steps=7).model == replace(ONE.model, num_steps=7)
     # What is legal only together is set together.
     assert TWO.vary(ppo__num_minibatches=3, ppo__rollout__num_steps=9).ppo.minibatch_size == 12
     for budget, changes, says in (
@@ -34,7 +34,7 @@ def test_a_budget_differs_in_what_is_said() -> None:
         (TWO, {"ppo__num_minibatches": 3}, "32 is not divisible by num_minibatches=3"),
         (TWO, {"num_updates": 1.5}, "num_updates must be int"),
         (TWO, {"sets": 3}, "sets is a group of fields"),
-        (ONE, {"hvae__kind": "autoencoder"}, "kind='autoencoder' is unknown"),
+        (ONE, {"model__kind": "autoencoder"}, "kind='autoencoder' is unknown"),
     ):
         with pytest.raises(ConfigError, match=says):
             budget.vary(**changes)
@@ -44,10 +44,13 @@ def test_a_budget_differs_in_what_is_said() -> None:
 def test_steps_of_an_encoder_of_more_actions(counts_epochs: bool) -> None:
     """As many steps, or as many passes: 24 actions in batches of 3 are 8 steps a pass, 12 are 4."""
     budget = replace(ONE, counts_epochs=counts_epochs)
-    assert budget.config("hvae", 12, 12) == budget.hvae
+    assert budget.config("hvae", 12, 12) == budget.model
     assert budget.config("hvae", 24, 12).num_steps == (8 if counts_epochs else 4)
     assert budget.config("vae", 24, 12).num_steps == (8 if counts_epochs else 4)
-    assert budget.config("vae", 12, 12) == budget.vae
+    assert budget.config("vae", 12, 12) == replace(budget.model, kind="vae")
+    own = replace(budget, vae_steps=6)
+    assert own.config("vae", 24, 12).num_steps == (12 if counts_epochs else 6)
+    assert own.config("hvae", 12, 12) == budget.model
 
 
 def test_what_is_foretold_follows_the_settings() -> None:

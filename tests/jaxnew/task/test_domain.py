@@ -75,8 +75,8 @@ def test_a_domain_is_a_task_with_a_split() -> None:
 def test_a_play_may_have_budgets_of_its_own() -> None:
     domain = Domain.of(video_task.TASK)
     states, video = video_task.TASK.plays
-    assert domain.stage_one(states, "smoke").hvae.num_steps == 2
-    assert domain.stage_one(video, "smoke").hvae.num_steps == 4
+    assert domain.stage_one(states, "smoke").model.num_steps == 2
+    assert domain.stage_one(video, "smoke").model.num_steps == 4
 
 
 def test_a_published_split_has_one_seed() -> None:
