@@ -16,7 +16,7 @@ from experiments.reports.runs import Group, RunRecord, group_runs, policies
 from experiments.reports.study_report import Study, StudyPoint
 from jaxnew.actions import ActionIdentity, ActionSplit
 from jaxnew.embedding import Encoder
-from jaxnew.recording import collect
+from jaxnew.recording import collect, parse_representation
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.results import Question
 from jaxnew.run import Run
@@ -87,9 +87,10 @@ def kind_of(name: str, task: Task, encoder: Path | None = None) -> StudyKind:
             "them complete at the last one; the last value is the whole set from the start.",
         )
     if name == "recordings":
+        every = _recordings_beside(Encoder.load(encoder)) if encoder else 1024
         return StudyKind(
             "recordings per test action",
-            [1024.0, 64.0, 16.0, 4.0, 1.0],
+            [float(every), *(number for number in (64.0, 16.0, 4.0, 1.0) if number < every)],
             partial(_recordings, encoder),
             "Test actions encoded by the frozen encoder from their first recordings only.",
             has_log_axis=True,
@@ -219,6 +220,22 @@ def study_runs(
     return Study(name, kind.axis, kind.has_log_axis, first.metric, tuple(points), *about)
 
 
+def _recordings_beside(encoder: Encoder) -> int:
+    """How many recordings per action lie beside an encoder.
+
+    Raises:
+      UsageError: none.
+    """
+    play = parse_representation(encoder.domain(), encoder.config.representation).play
+    folders = encoder.path.parent.glob(f"{play.folder}-*")
+    sizes = [int(folder.name.rpartition("-")[2]) for folder in folders]
+    if not sizes:
+        raise UsageError(
+            f"There are no recordings beside {encoder.path}; run: python -m experiments.collect."
+        )
+    return max(sizes)
+
+
 def encoded_test_actions(
     encoder: Path, split: ActionSplit, num_recordings: int
 ) -> RepresentationTable:
@@ -231,20 +248,13 @@ def encoded_test_actions(
     if trained.config.split_hash != split.hash:
         raise UsageError(f"{encoder} was trained with another split than the policy.")
     learner, weights, play = trained.frozen()
-    sizes = sorted(
-        int(folder.name.rpartition("-")[2]) for folder in encoder.parent.glob(f"{play.folder}-*")
-    )
-    if not sizes:
+    every = _recordings_beside(trained)
+    if not 1 <= num_recordings <= every:
         raise UsageError(
-            f"There are no recordings beside {encoder}; run: python -m experiments.collect."
-        )
-    if not 1 <= num_recordings <= sizes[-1]:
-        raise UsageError(
-            f"{num_recordings} recordings per action were asked for; {encoder.parent} has "
-            f"{sizes[-1]}."
+            f"{num_recordings} recordings per action were asked for; {encoder.parent} has {every}."
         )
     domain = trained.domain()
-    recordings = collect(domain, encoder.parent.parent, sizes[-1], play)
+    recordings = collect(domain, encoder.parent.parent, every, play)
     return RepresentationTable(
         vectors=learner.encode(weights, recordings.for_encoding(split.test, num_recordings)),
         ids=split.test,

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from experiments import analyze
-from experiments.reports.studies import encoded_test_actions
+from experiments.reports.studies import encoded_test_actions, kind_of
 from experiments.tasks.grid_world import TASK
 from jaxnew import collection
 from jaxnew.actions import ActionSplit
@@ -102,6 +102,7 @@ def test_an_encoder_sees_the_first_recordings_of_test_actions(runs: Path) -> Non
     everything = encoded_test_actions(runs / ENCODER, split, 16)
     assert everything.made_by == table.hash
     np.testing.assert_allclose(everything.vectors, table.rows(split.test), atol=1e-5)
+    assert kind_of("recordings", TASK, runs / ENCODER).values == [16.0, 4.0, 1.0]
     with pytest.raises(UsageError, match=r"17 recordings per action were asked for.*has 16"):
         encoded_test_actions(runs / ENCODER, split, 17)
     other = replace(split, seed=1)
