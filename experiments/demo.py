@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -26,23 +27,31 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
+_LENGTH = 1.5  # Its steps, in those of the budget: what ten minutes on two cores allow.
 
 
 def main() -> int | None:
     start = time.perf_counter()
     task, budget = load_task("grid_world"), ARGUMENTS.budget
     encoder = embed(task, budget=budget, runs=ARGUMENTS.runs)
+    preset = task.budget(budget)
+    num_updates = round(_LENGTH * preset.num_updates)
     run = train(
         task,
         encoder.table,
         budget=budget,
+        set={
+            "num_updates": num_updates,
+            "ppo.lr_steps": num_updates * preset.ppo.steps_per_update,
+        },
+        workdir=Path(ARGUMENTS.runs) / task.name / f"demo-{budget}",
         runs=ARGUMENTS.runs,
         overwrite=ARGUMENTS.overwrite,
     )
     if run.was_interrupted:
         return run.interrupted_by
     print_report(encoder)
-    print_success(run, task.budget(budget).final_episodes)
+    print_success(run, preset.final_episodes)
     out = RunDirectory.load(run.path).figures
     for file in figures.make_figures([run.path], out):
         print(f"  {file}")

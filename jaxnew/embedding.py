@@ -165,8 +165,11 @@ class Encoder:
         if not self.is_finished:
             raise UsageError(f"{self.path} was interrupted; embed again to go on.")
         folder, (_, weights, _) = Path(folder), self.frozen()
-        RunDirectory.load(self.path).export(folder, (SPLIT_FILE, TABLE_FILE))
-        _write_weights(folder / WEIGHTS_FILE, weights)
+        RunDirectory.load(self.path).export(
+            folder,
+            (SPLIT_FILE, TABLE_FILE),
+            lambda new: _write_weights(new / WEIGHTS_FILE, weights),
+        )
         return folder
 
     def report(self) -> dict[str, Any]:

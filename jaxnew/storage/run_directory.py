@@ -282,13 +282,16 @@ class RunDirectory:
             names = sorted(file.stem for file in self.path.glob("evaluation/[!.]*.json"))
         return {name: self.evaluation(name) for name in names}
 
-    def export(self, folder: Path, files: Sequence[str]) -> None:
+    def export(
+        self, folder: Path, files: Sequence[str], write_more: Callable[[Path], None]
+    ) -> None:
         """Copies what others need into a new folder, which can be loaded like the run.
 
         Of each session its hashes, revision and versions; no commands, machines or checkpoints.
 
         Args:
           files: names of the files to be copied.
+          write_more: called with the folder before it is one that can be loaded.
 
         Raises:
           StorageError: the folder exists, or the system refuses.
@@ -303,6 +306,7 @@ class RunDirectory:
             folder.mkdir(parents=True)
             for name in ("config.json", *files):
                 write_bytes_atomically(folder / name, (self.path / name).read_bytes())
+            write_more(folder)
             write_json_atomically(folder / "provenance.json", provenance)  # Now it is a run.
 
     def close(self) -> None:

@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxnew import embedding
 from jaxnew.actions import SplitMismatch
 from jaxnew.embedding import (
     SPLIT_FILE,
@@ -30,7 +31,7 @@ from jaxnew.storage.checkpoint import CheckpointError
 from jaxnew.storage.config import ConfigError
 from jaxnew.storage.files import StorageError
 from jaxnew.storage.metrics import read
-from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory
+from jaxnew.storage.run_directory import ConfigMismatch, RunDirectory, RunDirectoryError
 from jaxnew.task.domain import Domain
 from jaxnew.task.places import UsageError
 from jaxnew.training import train
@@ -251,6 +252,20 @@ def test_an_export_is_small_and_says_nothing_of_its_maker(encoder: Encoder, tmp_
         encoder.export(tmp_path / "mine")
     with pytest.raises(UsageError, match="was interrupted"):
         replace(encoder, _table=None).export(tmp_path / "other")
+
+
+def test_half_an_export_is_no_run(
+    encoder: Encoder, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(embedding, "write_arrays", stopped)
+    with pytest.raises(KeyboardInterrupt):
+        encoder.export(tmp_path / "mine")
+    with pytest.raises(RunDirectoryError, match="it has no provenance"):
+        Encoder.load(tmp_path / "mine", LADDER)
+
+
+def stopped(*args: Any) -> None:
+    raise KeyboardInterrupt
 
 
 def test_its_report_is_kept(encoder: Encoder) -> None:
