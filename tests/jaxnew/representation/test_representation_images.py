@@ -168,6 +168,38 @@ def test_the_encoder_reads_every_frame_and_hands_on_the_first():
     np.testing.assert_allclose(changed[:, 0, 1], h[:, 0, 1], atol=1e-6)
 
 
+@pytest.mark.oracle
+def test_changes_of_pixels_are_read_as_channels():
+    features = RNG.uniform(-0.5, 0.5, (1, 2, 3, 48 * 48)).astype(np.float32)
+    frames = features.reshape(1, 2, 3, *VIDEO)
+    changes = frames - np.concatenate([frames[:, :, :1], frames[:, :, :-1]], axis=2)
+    both = np.concatenate([frames, changes], axis=-1).reshape(1, 2, 3, -1)
+    plain, reading = (
+        images.ImageRecordingEncoder(5, (48, 48, 2)),
+        images.ImageRecordingEncoder(5, VIDEO, reads_changes=True),
+    )
+    variables = variables_of(reading, features, False)
+    expected = jax.jit(lambda: plain.apply(variables, both, False))()
+    found = jax.jit(lambda: reading.apply(variables, features, False))()
+    for ours, theirs in zip(found, expected, strict=True):
+        np.testing.assert_allclose(ours, theirs, atol=1e-6)
+
+
+@pytest.mark.unit
+def test_a_video_of_changes_starts_as_its_first_frame():
+    features = RNG.uniform(-0.5, 0.5, (1, 2, 3, 48 * 48)).astype(np.float32)
+    g, codes = np.ones((12, 1, 2), np.float32), np.ones((1, 2, 288), np.float32)
+    distances = []
+    for predicts_changes in (False, True):
+        decoder = images.ImageRecordingDecoder(12, VIDEO, False, predicts_changes)
+        args = (g, codes, features, AS_GIVEN)
+        variables = jax.jit(lambda key, m=decoder, a=args: m.init(key, *a, True))(jax.random.key(0))
+        means, _ = in_training(decoder, variables, *args)
+        distances.append(np.abs(means - features[:, :, :1]).mean())
+    assert distances[0] > 0.05
+    assert distances[1] < 0.01
+
+
 @pytest.mark.golden
 def test_parameter_counts_are_the_specs_without_its_unused_layers():
     # The release has 1,583,280 (video) and 1,429,938 (still images), unused layers included. These
