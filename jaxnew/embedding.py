@@ -156,7 +156,7 @@ class Encoder:
         return learner, state.weights, play
 
     def export(self, folder: Path | str) -> Path:
-        """A copy for others, all that `load` and `encode` need: one or two megabytes.
+        """A copy for others, all that `load` and `encode` need: a few megabytes.
 
         Raises:
           UsageError: its training was interrupted.

@@ -14,7 +14,7 @@ from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.places import UsageError, place_of
 from tests.experiments.commands import run
 
-NAMES = ["grid_world"]
+NAMES = ["grid_world", "create"]
 IDS = np.array([0, 5, 1023], np.int32)
 
 
