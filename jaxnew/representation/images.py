@@ -123,7 +123,9 @@ class Convolution(nn.Module):
         """f32[B, H, W, C] -> f32[B, H', W', O]."""
         init = uniform_within(1.0 / math.sqrt(WINDOW**2 * x.shape[-1]))
         kernel = self.param("kernel", init, (WINDOW, WINDOW, x.shape[-1], self.features))
-        y = convolution_by_xla(x, kernel, self.stride)  # Steps on images are no part of a loop.
+        y = convolution_by_xla(
+            x, kernel, self.stride
+        )  # On CPUs no part of a loop, see the learner.
         return y + self.param("bias", init, (self.features,))
 
 

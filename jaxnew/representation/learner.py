@@ -25,7 +25,7 @@ from jaxnew.representation.objective import (
     reconstruction_weight,
     weighted_loss,
 )
-from jaxnew.representation.sources import RecordingSource, padded_chunks
+from jaxnew.representation.sources import RecordingSource, StoredRecordings, padded_chunks
 from jaxnew.representation.vae import build_model
 
 __all__ = ["Modality", "RepresentationConfig", "RepresentationLearner", "RepresentationState"]
@@ -151,6 +151,10 @@ class RepresentationLearner:
         self._check_trainable(recordings.shape)
         if num_steps < 1:
             raise ValueError(f"num_steps={num_steps} must be at least 1.")
+        is_source = isinstance(recordings, RecordingSource)
+        if not is_source and self.modality.image_shape and jax.default_backend() == "cpu":
+            # Inside of loops XLA's convolutions are ten times slower there.
+            recordings = StoredRecordings(np.asarray(recordings))
         if isinstance(recordings, RecordingSource):
             return self._run_on_source(state, recordings, num_steps)
         return self._run(state, jnp.asarray(recordings), jnp.int32(num_steps))

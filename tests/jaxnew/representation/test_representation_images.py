@@ -270,6 +270,7 @@ def test_a_learner_trains_on_stored_videos():
     recordings = RNG.integers(0, 256, (2, 2, 2, *VIDEO)).astype(np.uint8)
     learner = RepresentationLearner(config, image_modality("video", VIDEO))
     state = learner.init(jax.random.key(0), recordings.shape)
+    learner._run = None  # On a CPU steps on images are no part of a loop.
     trained, metrics = learner.train_steps(state, recordings, 2)
     assert np.isfinite(float(metrics["loss"]))
     assert cause_of(metrics) is None
