@@ -238,8 +238,6 @@ TASK = Task(
             num_recordings=8,
             model__num_steps=8,
             model__recordings_per_action=4,
-            vae__num_steps=8,
-            vae__recordings_per_action=4,
             checkpoint_every=20,
             cost="seconds",
         ),

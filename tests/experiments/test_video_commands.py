@@ -194,7 +194,7 @@ def test_every_create_task_has_videos(name: str) -> None:
         assert play.seen.shape == (7, 48, 48, 1)
         assert set(play.stage_one) == {"smoke", "laptop", "paper"}
         budget = domain.stage_one(play, "paper")
-        config = getattr(budget, kind)
+        config = budget.config(kind, 1098, 1098)
         sizes = config.actions_per_batch, config.recordings_per_action, config.num_steps
         assert (sizes, budget.num_recordings) == ((32, 45, 170_000), 1024)
         assert not budget.stores_drawn
