@@ -90,7 +90,7 @@ def print_report(encoder: Encoder) -> None:
 
 
 def _cells(numbers: Mapping[str, Any]) -> dict[str, str]:
-    """The numbers of one table by what they are, first what tells most of a policy's success."""
+    """The numbers of one table by what they are, first what ordered policies best in pilots."""
     found = {f"5-NN R2 to {fact}": r2 for fact, r2 in numbers["neighbour_r2"].items()}
     found |= {"5-NN purity": numbers["purity_all"], "of held-out": numbers["purity_held_out"]}
     found |= {f"linear R2 to {fact}": r2 for fact, r2 in numbers["linear_r2_mean"].items()}

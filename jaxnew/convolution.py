@@ -1,7 +1,8 @@
 """3x3 convolutions with padding 1, in the form that is fast where they run.
 
-On a CPU they are matrix products with the columns of all windows: XLA's gradients of a convolution
-are several times slower there (`experiments/benchmarks/images.py` has the ratios).
+Inside of loops, such as those over a policy's microbatches, on a CPU they are matrix products with
+the columns of all windows: there XLA's own gradients take ten times as long
+(`experiments/benchmarks/images.py`). Outside of loops XLA's are faster, and encoders use them.
 """
 
 from __future__ import annotations
