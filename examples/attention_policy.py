@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jaxnew.environment import Action
 from jaxnew.policy.distributions import Categorical
 from jaxnew.policy.method import MethodContext
-from jaxnew.policy.state_encoder import FEATURE_SIZE, StateCritic, StateEncoder, apply
+from jaxnew.policy.state_encoder import StateCritic, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 WIDTH = 32
@@ -42,7 +42,7 @@ class SetUtility(nn.Module):
         """Utilities f32[..., m].
 
         Args:
-          features: f32[..., 64] of the state.
+          features: f32[..., w] of the state.
           projected: f32[..., m, 32] `project` of the available actions.
           mask: bool[..., m] true for a real entry; what stands in the others does not matter.
         """
@@ -63,15 +63,15 @@ class AttentionMethod:
     name = "attention"
 
     def __init__(self, context: MethodContext) -> None:
-        del context  # It needs to know nothing of the run.
-        self._encoder = StateEncoder()
-        self._critic = StateCritic()
+        self._width = context.network.state_width
+        self._encoder = StateEncoder(self._width)
+        self._critic = StateCritic(self._width)
         self._utility = SetUtility()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_encoder, key_critic, key_utility = jax.random.split(key, 3)
-        feature = jnp.zeros(FEATURE_SIZE, jnp.float32)
+        feature = jnp.zeros(self._width, jnp.float32)
         some_set = jnp.zeros((2, representation_size), jnp.float32), jnp.ones(2, bool)
         return {
             "encoder": self._encoder.init(key_encoder, obs)["params"],

@@ -12,11 +12,10 @@ import numpy as np
 from jaxnew.actions import ActionIdentity, ActionUniverse, SplitMismatch
 from jaxnew.ppo import Learner
 from jaxnew.representation.table import RepresentationTable
-from jaxnew.task.methods import method_of
 from jaxnew.task.places import UsageError
 from jaxnew.task.settings import with_settings
 from jaxnew.task.task import Task
-from jaxnew.trainer import Trainer, rollout_of
+from jaxnew.trainer import Trainer, policy_of, rollout_of
 
 OTHER_ENCODER, UNKNOWN_ACTIONS = "other-encoder", "unknown-actions"
 ALLOWANCES = (OTHER_ENCODER, UNKNOWN_ACTIONS)
@@ -162,14 +161,7 @@ def _moved(
         for part in ("train", "validation", "test", "always_available")
     }
     task = with_settings(task, config)
-    method = method_of(
-        config.method,
-        task,
-        replace(split, **behind),
-        config.trained_on,
-        action_spec=task.action_spec,
-        conditions_position=config.conditions_position,
-    )
+    method = policy_of(config, task, replace(split, **behind))
     rollout = rollout_of(task, method, config.ppo, config.seed, trainer.num_workers)
     moved = replace(
         trainer,

@@ -230,6 +230,25 @@ class Actions:
             )
         return replace(self, first_size=first_size, growth=growth)
 
+    def perturbed(self, key: jax.Array, noise: float | jax.Array) -> Actions:
+        """The same actions with Gaussian noise on their representations; consumes `key`.
+
+        To learn with such noise is to prefer utilities that change slowly from an action to the
+        next (Bishop, *Training with Noise is Equivalent to Tikhonov Regularization*, 1995).
+
+        Args:
+          noise: deviation of the noise, f32[], in that of each dimension over the actions that sets
+            are drawn from: others may be unknown to the policy.
+        """
+        members = self.table[self.pool.ids]
+        is_member = (jnp.arange(len(members), dtype=jnp.int32) < self.pool.size)[:, None]
+        deviation = jnp.std(members, axis=0, where=is_member)
+
+        def with_noise(table: jax.Array) -> jax.Array:
+            return table + noise * deviation * jax.random.normal(key, table.shape, jnp.float32)
+
+        return replace(self, table=jax.lax.cond(noise > 0, with_noise, lambda x: x, self.table))
+
     @property
     def num_actions(self) -> int:
         """How many actions sets are drawn from, those that are always available included."""

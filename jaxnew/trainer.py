@@ -65,14 +65,7 @@ class Trainer:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
         task = with_settings(task, config)
-        method = method_of(
-            config.method,
-            task,
-            split,
-            config.trained_on,
-            action_spec=task.action_spec,
-            conditions_position=config.conditions_position,
-        )
+        method = policy_of(config, task, split)
         rollout = rollout_of(task, method, config.ppo, config.seed, num_workers)
         vectors = jax.numpy.asarray(table.rows(np.arange(len(table.ids))))
         always = split.always_available
@@ -189,6 +182,19 @@ class Trainer:
 def _drawn(training: Actions) -> Actions:
     """All actions of a fixed set, in an order drawn for each episode."""
     return replace(training, is_fixed=False, padded_size=training.set_size)
+
+
+def policy_of(config: TrainConfig, task: Task, split: ActionSplit) -> PolicyMethod:
+    """The policy of a run, before it has parameters."""
+    return method_of(
+        config.method,
+        task,
+        split,
+        config.trained_on,
+        action_spec=task.action_spec,
+        conditions_position=config.conditions_position,
+        network=config.network,
+    )
 
 
 def rollout_of(

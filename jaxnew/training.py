@@ -199,6 +199,7 @@ def train_config(
         sets=budget.sets,
         hyperparameters=budget.hyperparameters,
         loop=budget.loop,
+        network=budget.network,
         environment_version=task.environment_version,
         environment=task.environment,
         pool=None if task.host is None else task.host.pool_settings,

@@ -25,7 +25,7 @@ def gradient_subject(
     form: Callable[..., jax.Array], shape: tuple[int, int, int], num_images: int, size: int
 ) -> m.Subject:
     """The gradient of the trunk's parameters, summed over microbatches of `size` images."""
-    encoder = ImageEncoder(form)
+    encoder = ImageEncoder(form=form)
 
     def loss(params: Any, images: jax.Array) -> jax.Array:
         return jnp.sum(jnp.tanh(jnp.asarray(encoder.apply(params, images))))

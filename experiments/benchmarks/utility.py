@@ -15,7 +15,8 @@ import jax.numpy as jnp
 from experiments.benchmarks import _measure as m
 from experiments.benchmarks import _trainers
 from jaxnew.policy import Categorical, UtilityMethod
-from jaxnew.policy.state_encoder import FEATURE_SIZE, VectorEncoder
+from jaxnew.policy.config import NetworkConfig
+from jaxnew.policy.state_encoder import VectorEncoder
 from jaxnew.policy.utility import Utility
 from jaxnew.ppo import Learner
 from jaxnew.rollout.device import DeviceRollout
@@ -91,7 +92,7 @@ def report_layer(report: m.Report) -> None:
 
     def inputs(key: jax.Array) -> tuple[Any, ...]:
         keys = jax.random.split(key, 5)
-        features = jnp.tanh(jax.random.normal(keys[0], (num_states, FEATURE_SIZE)))
+        features = jnp.tanh(jax.random.normal(keys[0], (num_states, NetworkConfig.state_width)))
         table = jax.random.normal(keys[1], (num_actions, _trainers.REPRESENTATION_SIZE))
         ids = jax.random.randint(keys[2], (num_states, set_size), 0, num_actions)
         params = Utility().init(keys[3], features[0], table[:1], method="concatenated")

@@ -23,9 +23,10 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action, ActionSpec
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.distributions import Beta, Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, apply, orthogonal_dense
-from jaxnew.policy.utility import HIDDEN_SIZE, UtilityMethod
+from jaxnew.policy.state_encoder import FeatureMethod, apply, orthogonal_dense
+from jaxnew.policy.utility import UtilityMethod
 from jaxnew.sampling import AvailableSet
 
 POSITION_ENTROPY_WEIGHT = 0.1  # Inside the entropy, beside its coefficient.
@@ -128,7 +129,7 @@ class HybridDistribution:
 
 
 class _Heads(nn.Module):
-    """State feature f32[..., 64] -> parameters of what the domain has."""
+    """State feature f32[..., w] -> parameters of what the domain has."""
 
     position_dim: int
     has_stop: bool
@@ -149,27 +150,34 @@ class _Heads(nn.Module):
 
 
 class _ConditionedHead(nn.Module):
-    """One parameter of the position, from a state and every available action."""
+    """One parameter of the position, from a state and every available action.
+
+    Attributes:
+      position_dim: k.
+      network: sizes; w below is its `state_width`, h its `utility_width`.
+    """
 
     position_dim: int
+    network: NetworkConfig
 
     def setup(self) -> None:
         init = nn.initializers.orthogonal(_POSITION_GAIN)
-        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE), jnp.float32)
-        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,), jnp.float32)
+        width, hidden = self.network.state_width, self.network.utility_width
+        self.kernel = self.param("kernel", init, (2 * width, hidden), jnp.float32)
+        self.bias = self.param("bias", nn.initializers.zeros, (hidden,), jnp.float32)
         self.out = orthogonal_dense(self.position_dim, _POSITION_GAIN)
 
     def project(self, embedded: jax.Array) -> jax.Array:
-        """f32[..., 64] -> f32[..., 64], the action's share of the hidden layer, bias included."""
-        return embedded @ self.kernel[FEATURE_SIZE:] + self.bias
+        """f32[..., w] -> f32[..., h], the action's share of the hidden layer, bias included."""
+        return embedded @ self.kernel[self.network.state_width :] + self.bias
 
     def __call__(self, features: jax.Array, projected: jax.Array) -> jax.Array:
-        """f32[..., m, k] above 1, from features f32[..., 64] and projected actions [..., m, 64]."""
-        hidden = (features @ self.kernel[:FEATURE_SIZE])[..., None, :] + projected
+        """f32[..., m, k] above 1, from features f32[..., w] and projected actions [..., m, h]."""
+        hidden = (features @ self.kernel[: self.network.state_width])[..., None, :] + projected
         return 1.0 + nn.softplus(self.out(nn.relu(hidden)))
 
     def concatenated(self, features: jax.Array, embedded: jax.Array) -> jax.Array:
-        """The same f32[..., k] as the paper writes it, for one embedded action f32[..., 64]."""
+        """The same f32[..., k] as the paper writes it, for one embedded action f32[..., w]."""
         hidden = jnp.concatenate([features, embedded], axis=-1) @ self.kernel + self.bias
         return 1.0 + nn.softplus(self.out(nn.relu(hidden)))
 
@@ -194,18 +202,19 @@ class AuxiliaryMethod(FeatureMethod):
                 "Only a position that comes with a choice of the utility policy can be conditioned "
                 f"on it; got method {base.name!r} and {action_spec.position_dim} coordinates."
             )
+        super().__init__(base.network)
         self.name: str = base.name
         self._base = base
         self._is_conditioned = is_conditioned
         dim = action_spec.position_dim
         self._heads = _Heads(0 if is_conditioned else dim, action_spec.has_stop)
         self._position_dim = dim
-        self._conditioned = _ConditionedHead(dim)
+        self._conditioned = _ConditionedHead(dim, self.network)
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_base, key_heads, key_alpha, key_beta = jax.random.split(key, 4)
-        feature = jnp.zeros(FEATURE_SIZE, jnp.float32)
+        feature = jnp.zeros(self.network.state_width, jnp.float32)
         auxiliary = {"heads": self._heads.init(key_heads, feature).get("params", {})}
         if self._is_conditioned:
             for name, key_head in (("alpha", key_alpha), ("beta", key_beta)):
@@ -215,7 +224,7 @@ class AuxiliaryMethod(FeatureMethod):
         return {**self._base.init(key_base, obs, representation_size), "auxiliary": auxiliary}
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """The method's projection and, conditioned, those of alpha and beta: f32[..., 3 * 64]."""
+        """The method's projection and, conditioned, those of alpha and beta: f32[..., 3 h]."""
         projected = self._base.project(params, representations)
         if not self._is_conditioned:
             return projected
@@ -227,7 +236,7 @@ class AuxiliaryMethod(FeatureMethod):
         return jnp.concatenate([projected, *shares], axis=-1)
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[..., 64] the state feature of the method."""
+        """f32[..., w] the state feature of the method."""
         features: jax.Array = self._base.features(params, obs)
         return features
 
@@ -235,12 +244,13 @@ class AuxiliaryMethod(FeatureMethod):
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> HybridDistribution:
         """The joint distribution; see the method's own."""
-        rows = projected[..., :HIDDEN_SIZE] if self._is_conditioned else projected
+        hidden = self.network.utility_width
+        rows = projected[..., :hidden] if self._is_conditioned else projected
         choice = self._base.distribution_of(params, features, rows, mask)
         heads: Any = self._heads.apply({"params": params["auxiliary"]["heads"]}, features)
         stop, position = heads
         if self._is_conditioned:
-            shares = jnp.split(projected[..., HIDDEN_SIZE:], 2, axis=-1)
+            shares = jnp.split(projected[..., hidden:], 2, axis=-1)
             alpha, beta = (
                 apply(self._conditioned, params["auxiliary"][name], features, share)
                 for name, share in zip(("alpha", "beta"), shares, strict=True)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from flax import struct
 
 from jaxnew.environment import Action
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.distributions import nearest_id
 from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
@@ -62,9 +63,10 @@ class _GaussianPolicy(nn.Module):
     """Observation -> mean and variance, f32[..., d] each."""
 
     size: int
+    width: int
 
     def setup(self) -> None:
-        self.encoder = StateEncoder()
+        self.encoder = StateEncoder(self.width)
         self.mean = orthogonal_dense(self.size, 1.0)
         self.variance = orthogonal_dense(self.size, 1.0)
 
@@ -83,14 +85,15 @@ class ContinuousMethod(FeatureMethod):
 
     name = "continuous"
 
-    def __init__(self, sums_entropy: bool = False) -> None:
+    def __init__(self, sums_entropy: bool = False, network: NetworkConfig | None = None) -> None:
+        super().__init__(network)
         self._sums_entropy = sums_entropy
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
         key_policy, key_critic = jax.random.split(key)
         return {
-            "policy": _GaussianPolicy(representation_size).init(key_policy, obs)["params"],
+            "policy": self._policy(representation_size).init(key_policy, obs)["params"],
             "critic": self.init_critic(key_critic, obs),
         }
 
@@ -100,18 +103,22 @@ class ContinuousMethod(FeatureMethod):
         return representations
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[..., 64] the state feature."""
-        return apply(_GaussianPolicy(0), params["policy"], obs, method="features")
+        """f32[..., w] the state feature."""
+        return apply(self._policy(0), params["policy"], obs, method="features")
 
     def distribution_of(
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> DiagonalGaussian:
-        """`distribution` from the state feature f32[..., 64]."""
+        """`distribution` from the state feature f32[..., w]."""
         del mask
-        policy = _GaussianPolicy(projected.shape[-1])
+        policy = self._policy(projected.shape[-1])
         both = apply(policy, params["policy"], features, method="output")
         return DiagonalGaussian(both[0], both[1], self._sums_entropy)
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The available action nearest to each point."""
         return Action.of(nearest_id(sample, available, table))
+
+    def _policy(self, size: int) -> _GaussianPolicy:
+        """The network that gives points of `size` numbers."""
+        return _GaussianPolicy(size, self.network.state_width)

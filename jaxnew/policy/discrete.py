@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.environment import Action
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.distributions import Categorical, nearest_id
 from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply, orthogonal_dense
 from jaxnew.sampling import AvailableSet
@@ -24,9 +25,10 @@ class _DiscretePolicy(nn.Module):
     """Observation -> logits f32[..., num_actions]."""
 
     num_actions: int
+    width: int
 
     def setup(self) -> None:
-        self.encoder = StateEncoder()
+        self.encoder = StateEncoder(self.width)
         self.logits = orthogonal_dense(self.num_actions, _HEAD_GAIN)
 
     def features(self, obs: jax.Array) -> jax.Array:
@@ -51,11 +53,12 @@ class DiscreteMethod(FeatureMethod):
 
     name = "discrete"
 
-    def __init__(self, train_ids: np.ndarray) -> None:
+    def __init__(self, train_ids: np.ndarray, network: NetworkConfig | None = None) -> None:
+        super().__init__(network)
         if len(train_ids) == 0:
             raise ValueError("The discrete method needs the ids of the actions it is trained on.")
         self._train_ids = np.asarray(train_ids, np.int32)
-        self._policy = _DiscretePolicy(len(train_ids))
+        self._policy = _DiscretePolicy(len(train_ids), self.network.state_width)
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
@@ -72,13 +75,13 @@ class DiscreteMethod(FeatureMethod):
         return representations
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[..., 64] the state feature."""
+        """f32[..., w] the state feature."""
         return apply(self._policy, params["policy"], obs, method="features")
 
     def distribution_of(
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Categorical:
-        """`distribution` from the state feature f32[..., 64]."""
+        """`distribution` from the state feature f32[..., w]."""
         del projected, mask
         return Categorical(apply(self._policy, params["policy"], features, method="output"))
 

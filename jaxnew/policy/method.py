@@ -11,9 +11,10 @@ import numpy as np
 
 from jaxnew.environment import Action, ActionSpec
 from jaxnew.policy.auxiliary import AuxiliaryMethod
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.continuous import ContinuousMethod
 from jaxnew.policy.discrete import DiscreteMethod
-from jaxnew.policy.utility import RandomMethod, UtilityMethod
+from jaxnew.policy.utility import ModulatedMethod, RandomMethod, UtilityMethod
 from jaxnew.sampling import AvailableSet
 
 Params = Any
@@ -110,19 +111,22 @@ class MethodContext:
         dimensions, as in Grid World, or averaged, as elsewhere.
       action_spec: of the domain; what comes with a choice there gets heads. None: nothing does.
       conditions_position: the position's head reads the chosen action too.
+      network: sizes.
     """
 
     train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
     sums_gaussian_entropy: bool = False
     action_spec: ActionSpec | None = None
     conditions_position: bool = False
+    network: NetworkConfig = field(default_factory=NetworkConfig)
 
 
 METHODS: dict[str, Callable[[MethodContext], PolicyMethod]] = {
-    "ours": lambda context: UtilityMethod(),
-    "continuous": lambda context: ContinuousMethod(context.sums_gaussian_entropy),
-    "discrete": lambda context: DiscreteMethod(context.train_ids),
-    "random": lambda context: RandomMethod(),
+    "ours": lambda context: UtilityMethod(context.network),
+    "modulated": lambda context: ModulatedMethod(context.network),
+    "continuous": lambda context: ContinuousMethod(context.sums_gaussian_entropy, context.network),
+    "discrete": lambda context: DiscreteMethod(context.train_ids, context.network),
+    "random": lambda context: RandomMethod(context.network),
 }
 
 

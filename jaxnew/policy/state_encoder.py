@@ -16,8 +16,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxnew.convolution import WINDOW, convolution
+from jaxnew.policy.config import NetworkConfig
 
-FEATURE_SIZE = 64  # Width of the state feature f(s).
 _SQRT_2 = float(np.sqrt(2.0))
 _CHANNELS = (16, 16, 32, 32, 32)
 
@@ -71,48 +71,56 @@ class StridedConvolution(nn.Module):
 
 
 class ImageEncoder(nn.Module):
-    """Five convolutions and a dense layer, ReLU after each: uint8[..., H, W, C] -> f32[..., 64].
+    """Five convolutions and a dense layer, ReLU after each: uint8[..., H, W, C] -> f32[..., w].
 
     84x84 images become 42, 21, 11, 6, 3 pixels wide: 288 numbers. They are flattened as rows,
     columns, channels (the original's PyTorch: channels, rows, columns), which permutes the rows of
     the dense layer's weight and changes nothing else.
 
     Attributes:
+      width: w.
       form: of the convolutions, see `jaxnew.convolution`.
     """
 
+    width: int = NetworkConfig.state_width
     form: Callable[[jax.Array, jax.Array, int], jax.Array] = convolution
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        """State features f32[..., 64] of images uint8[..., H, W, C]."""
+        """State features f32[..., w] of images uint8[..., H, W, C]."""
         x = obs.reshape(-1, *obs.shape[-3:]).astype(jnp.float32) / 255.0
         for index, channels in enumerate(_CHANNELS):
             x = nn.relu(StridedConvolution(channels, self.form, name=f"convolution_{index}")(x))
         x = x.reshape(*obs.shape[:-3], -1)
-        return nn.relu(orthogonal_dense(FEATURE_SIZE, _SQRT_2, "dense")(x))
+        return nn.relu(orthogonal_dense(self.width, _SQRT_2, "dense")(x))
 
 
-def _vector_features(obs: jax.Array) -> jax.Array:
+def _vector_features(obs: jax.Array, width: int) -> jax.Array:
     """Makes its two layers in the module that calls it."""
-    x = nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(obs))
-    return nn.tanh(orthogonal_dense(FEATURE_SIZE, _SQRT_2)(x))
+    x = nn.tanh(orthogonal_dense(width, _SQRT_2)(obs))
+    return nn.tanh(orthogonal_dense(width, _SQRT_2)(x))
 
 
 class VectorEncoder(nn.Module):
-    """`dense 64, tanh, dense 64, tanh`: f32[..., n] -> f32[..., 64]."""
+    """`dense w, tanh, dense w, tanh`: f32[..., n] -> f32[..., w]."""
+
+    width: int = NetworkConfig.state_width
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return _vector_features(obs)
+        return _vector_features(obs, self.width)
 
 
 class StateEncoder(nn.Module):
-    """The state feature f(s): f32[..., n] or uint8[..., H, W, C] -> f32[..., 64]."""
+    """The state feature f(s): f32[..., n] or uint8[..., H, W, C] -> f32[..., w]."""
+
+    width: int = NetworkConfig.state_width
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return ImageEncoder(name="image")(obs) if is_image(obs) else _vector_features(obs)
+        if is_image(obs):
+            return ImageEncoder(self.width, name="image")(obs)
+        return _vector_features(obs, self.width)
 
 
 class StateCritic(nn.Module):
@@ -122,10 +130,12 @@ class StateCritic(nn.Module):
     gradient reaches.
     """
 
+    width: int = NetworkConfig.state_width
+
     @nn.compact
     def __call__(self, obs: jax.Array, features: jax.Array) -> jax.Array:
-        """Values of observations [..., n] or [..., H, W, C] with features f32[..., 64]."""
-        hidden = features if is_image(obs) else VectorEncoder()(obs)
+        """Values of observations [..., n] or [..., H, W, C] with features f32[..., w]."""
+        hidden = features if is_image(obs) else VectorEncoder(self.width)(obs)
         return orthogonal_dense(1, _SQRT_2, "value")(hidden)[..., 0]
 
 
@@ -136,22 +146,30 @@ def apply(module: nn.Module, params: Any, *inputs: jax.Array, **options: Any) ->
 
 class FeatureMethod:
     """Base of methods that have `features` and `distribution_of`, and keep a critic's parameters in
-    `params["critic"]`."""
+    `params["critic"]`.
 
-    _critic = StateCritic()
+    Attributes:
+      network: sizes; w below is its `state_width`.
+    """
+
+    def __init__(self, network: NetworkConfig | None = None) -> None:
+        self.network = network or NetworkConfig()
+        self._critic = StateCritic(self.network.state_width)
 
     def init_critic(self, key: jax.Array, obs: jax.Array) -> Any:
         """Fresh parameters of the critic; consumes `key`."""
-        return self._critic.init(key, obs, jnp.zeros(FEATURE_SIZE, jnp.float32))["params"]
+        return self._critic.init(key, obs, jnp.zeros(self.network.state_width, jnp.float32))[
+            "params"
+        ]
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[..., 64] the state feature."""
+        """f32[..., w] the state feature."""
         raise NotImplementedError
 
     def distribution_of(
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> Any:
-        """`distribution` from the state feature f32[..., 64]."""
+        """`distribution` from the state feature f32[..., w]."""
         raise NotImplementedError
 
     def distribution(

@@ -1,6 +1,7 @@
-"""The utility policy (paper section 4.2): scores each action of any set.
+"""Utility policies (paper section 4.2): they score each action of any set.
 
-The utility of an action with representation `c` in a state with feature `f` is
+The utility of an action with representation `c` in a state with feature `f` is, with the paper's
+widths of 64,
 
     a = Lin(d, 64)(c)
     u = Lin(64, 1)( ReLU( Lin(128, 64)( [f, a] ) ) )
@@ -9,6 +10,8 @@ and the policy is the softmax of the utilities of the available actions. The fir
 middle weight only ever meet `f` and the last 64 only `a`: `[f, a] @ W = f @ W[:64] + a @ W[64:]`.
 The second term depends on the action alone: `project` computes it once for a whole table, and what
 is left per state and action is an addition, a ReLU and a dot product with 64 numbers.
+
+Of `ModulatedUtility` these 64 numbers depend on the state.
 """
 
 from __future__ import annotations
@@ -20,56 +23,111 @@ import jax
 import jax.numpy as jnp
 
 from jaxnew.environment import Action
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FEATURE_SIZE, FeatureMethod, StateEncoder, apply
+from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
-HIDDEN_SIZE = 64
 _UTILITY_GAIN = 0.01  # The initial policy is almost exactly uniform.
+_HIDDEN_GAIN = 2.0**0.5
 
 
 class Utility(nn.Module):
-    """Scores of representations in a state; see the module docstring."""
+    """Scores of representations in a state; see the module docstring.
+
+    Attributes:
+      network: sizes; w below is its `state_width`, h its `utility_width`.
+    """
+
+    network: NetworkConfig = NetworkConfig()
+    gain = _UTILITY_GAIN  # Of all layers but the last.
 
     def setup(self) -> None:
-        init = nn.initializers.orthogonal(_UTILITY_GAIN)
-        self.embed = nn.Dense(FEATURE_SIZE, kernel_init=init)
-        self.kernel = self.param("kernel", init, (2 * FEATURE_SIZE, HIDDEN_SIZE), jnp.float32)
-        self.bias = self.param("bias", nn.initializers.zeros, (HIDDEN_SIZE,), jnp.float32)
-        self.score = nn.Dense(1, kernel_init=init)
+        width, hidden = self.network.state_width, self.network.utility_width
+        init = nn.initializers.orthogonal(self.gain)
+        self.embed = nn.Dense(width, kernel_init=init)
+        self.kernel = self.param("kernel", init, (2 * width, hidden), jnp.float32)
+        self.bias = self.param("bias", nn.initializers.zeros, (hidden,), jnp.float32)
+        last = nn.initializers.orthogonal(_UTILITY_GAIN)
+        self.score = nn.Dense(self.num_scores, kernel_init=last)
+
+    @property
+    def num_scores(self) -> int:
+        """Outputs of the last layer."""
+        return 1
 
     def embedded(self, representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., 64], the action alone."""
+        """f32[..., d] -> f32[..., w], the action alone."""
         return self.embed(representations)
 
     def project(self, representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., 64], the action's share of the hidden layer, bias included."""
-        return self.embed(representations) @ self.kernel[FEATURE_SIZE:] + self.bias
+        """f32[..., d] -> f32[..., h], the action's share of the hidden layer, bias included."""
+        return self.embedded(representations) @ self.kernel[self.network.state_width :] + self.bias
 
     def __call__(self, features: jax.Array, projected: jax.Array) -> jax.Array:
-        """Utilities f32[..., m] from features f32[..., 64] and projected actions [..., m, 64]."""
-        hidden = (features @ self.kernel[:FEATURE_SIZE])[..., None, :] + projected
-        return self.score(nn.relu(hidden))[..., 0]
+        """Utilities f32[..., m] from features f32[..., w] and projected actions [..., m, h]."""
+        hidden = (features @ self.kernel[: self.network.state_width])[..., None, :] + projected
+        return self.scored(features, nn.relu(hidden))
+
+    def scored(self, features: jax.Array, hidden: jax.Array) -> jax.Array:
+        """Utilities f32[..., m] from features f32[..., w] and the hidden layer f32[..., m, h]."""
+        del features
+        return self.score(hidden)[..., 0]
 
     def concatenated(self, features: jax.Array, representations: jax.Array) -> jax.Array:
         """The same utilities f32[..., m] as the paper writes them, from vectors f32[..., m, d].
 
         Kept as the reference for tests and benchmarks.
         """
-        embedded = self.embed(representations)
-        features = jnp.broadcast_to(features[..., None, :], (*embedded.shape[:-1], FEATURE_SIZE))
-        hidden = jnp.concatenate([features, embedded], axis=-1) @ self.kernel + self.bias
-        return self.score(nn.relu(hidden))[..., 0]
+        embedded = self.embedded(representations)
+        repeated = jnp.broadcast_to(
+            features[..., None, :], (*embedded.shape[:-1], features.shape[-1])
+        )
+        hidden = jnp.concatenate([repeated, embedded], axis=-1) @ self.kernel + self.bias
+        return self.scored(features, nn.relu(hidden))
+
+
+class ModulatedUtility(Utility):
+    """Utilities whose last weights depend on the state (docs/method.md, "Modulated utility").
+
+        a = ReLU( Lin(d, w)(c) )
+        u = sum over the hidden layer of Lin(w, h)(f) * ReLU( Lin(2 w, h)( [f, a] ) )
+
+    In each state it is a network of its own from embeddings to utilities, at the cost of one more
+    layer of `f`. Hidden layers have the usual gain of sqrt(2); the paper's gain of 0.01 in all of
+    them lets the utility learn slowly.
+    """
+
+    gain = _HIDDEN_GAIN
+
+    @property
+    def num_scores(self) -> int:
+        """One weight for each number of the hidden layer."""
+        return self.network.utility_width
+
+    def embedded(self, representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., w], the action alone."""
+        return nn.relu(self.embed(representations))
+
+    def scored(self, features: jax.Array, hidden: jax.Array) -> jax.Array:
+        """Utilities f32[..., m] from features f32[..., w] and the hidden layer f32[..., m, h]."""
+        return jnp.sum(hidden * self.score(features)[..., None, :], axis=-1)
 
 
 class UtilityMethod(FeatureMethod):
-    """Ours: a softmax over the utilities of the available actions. Its sample is the choice."""
+    """Ours: a softmax over the utilities of the available actions. Its sample is the choice.
+
+    Attributes:
+      network: sizes; w below is its `state_width`, h its `utility_width`.
+    """
 
     name = "ours"
+    utility_type: type[Utility] = Utility
 
-    def __init__(self) -> None:
-        self._encoder = StateEncoder()
-        self._utility = Utility()
+    def __init__(self, network: NetworkConfig | None = None) -> None:
+        super().__init__(network)
+        self._encoder = StateEncoder(self.network.state_width)
+        self._utility = self.utility_type(self.network)
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
@@ -79,18 +137,18 @@ class UtilityMethod(FeatureMethod):
             "critic": self.init_critic(key_critic, obs),
             "utility": self._utility.init(
                 key_utility,
-                jnp.zeros(FEATURE_SIZE, jnp.float32),
+                jnp.zeros(self.network.state_width, jnp.float32),
                 jnp.zeros((1, representation_size), jnp.float32),
                 method="concatenated",
             )["params"],
         }
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., 64]: all that the policy needs of an action, in any state."""
+        """f32[..., d] -> f32[..., h]: all that the policy needs of an action, in any state."""
         return apply(self._utility, params["utility"], representations, method="project")
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
-        """f32[..., 64] the state feature `f(s)`."""
+        """f32[..., w] the state feature `f(s)`."""
         return apply(self._encoder, params["encoder"], obs)
 
     def distribution_of(
@@ -100,21 +158,28 @@ class UtilityMethod(FeatureMethod):
 
         Args:
           params: as `init` makes them.
-          features: f32[..., 64] state features.
-          projected: f32[..., m, 64] `project` of the available representations.
+          features: f32[..., w] state features.
+          projected: f32[..., m, h] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
         utilities = apply(self._utility, params["utility"], features, projected)
         return Categorical.masked(utilities, mask)
 
     def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., 64]: the `a` of the module docstring."""
+        """f32[..., d] -> f32[..., w]: the `a` of the utility."""
         return apply(self._utility, params["utility"], representations, method="embedded")
 
     def decode(self, sample: jax.Array, available: AvailableSet, table: jax.Array) -> Action:
         """The action behind a choice int32[...] from sets [..., m]."""
         del table
         return Action.of(available.id_of(sample))
+
+
+class ModulatedMethod(UtilityMethod):
+    """A utility policy with a `ModulatedUtility`."""
+
+    name = "modulated"
+    utility_type = ModulatedUtility
 
 
 class RandomMethod(UtilityMethod):

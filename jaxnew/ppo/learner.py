@@ -20,6 +20,7 @@ from jaxnew.storage.metrics import TIME_PREFIX
 
 # Folded into the key of a run where updates fold in their number, which is never as high.
 _RESTART = 2**31 - 1
+_NOISE = 2  # Folded into the key of an update, which is split in two besides.
 
 
 @dataclass(frozen=True)
@@ -66,7 +67,11 @@ class Learner(GradientSteps):
         """
         start = time.perf_counter()
         hyperparameters = jax.tree.map(jnp.float32, hyperparameters)
-        key_rollout, key_learn = jax.random.split(jax.random.fold_in(state.key, state.step))
+        key_update = jax.random.fold_in(state.key, state.step)
+        key_rollout, key_learn = jax.random.split(key_update)
+        actions = actions.perturbed(
+            jax.random.fold_in(key_update, _NOISE), hyperparameters.representation_noise
+        )
         rollout, batch, sums = self.rollout.collect(
             key_rollout, state.rollout, state.params, actions, hyperparameters.discount
         )

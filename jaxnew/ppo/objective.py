@@ -24,6 +24,8 @@ class Hyperparameters:
       discount: gamma.
       gae_lambda: lambda of the advantage estimator.
       value_coefficient: weight of the value loss.
+      representation_noise: deviation of the Gaussian noise on representations during training, in
+        that of the actions that are trained with, see `Actions.perturbed`.
     """
 
     learning_rate: float = 1e-3
@@ -32,6 +34,7 @@ class Hyperparameters:
     discount: float = 0.99
     gae_lambda: float = 0.95
     value_coefficient: float = 0.5
+    representation_noise: float = 0.0
 
     def check(self) -> None:
         """Raises ValueError unless every number, none of them traced, is in its range."""
@@ -42,6 +45,7 @@ class Hyperparameters:
             "discount": (0.0, 1.0),
             "gae_lambda": (0.0, 1.0),
             "value_coefficient": (0.0, math.inf),
+            "representation_noise": (0.0, math.inf),
         }
         for name, (low, high) in ranges.items():
             value = getattr(self, name)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.sampling import SetConfig
@@ -100,6 +101,7 @@ class StageTwoBudget:
       ppo: shapes of the learner.
       sets: which sets it learns with.
       hyperparameters: its numbers.
+      network: sizes of the policy's networks.
       loop: evaluations and checkpoints.
       final_episodes: episodes per split of an evaluation after training.
       cost: what it takes; shown before it starts.
@@ -111,6 +113,7 @@ class StageTwoBudget:
     ppo: PPOConfig = field(default_factory=PPOConfig)
     sets: SetConfig = field(default_factory=SetConfig)
     hyperparameters: Hyperparameters = field(default_factory=Hyperparameters)
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     loop: LoopConfig = field(default_factory=LoopConfig)
 
     def vary(self, **changes: Any) -> StageTwoBudget:

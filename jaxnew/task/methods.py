@@ -7,13 +7,15 @@ everything else is as for ours.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
 from jaxnew.actions import ActionSplit
 from jaxnew.environment import ActionSpec
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.method import METHODS, MethodContext, PolicyMethod, make_method
 from jaxnew.task.budgets import StageTwoBudget
 from jaxnew.task.places import UsageError, load_place
@@ -24,27 +26,35 @@ _FIXED_SET_NUMBERS = 2**14  # Scored action and state pairs per microbatch that 
 
 @dataclass(frozen=True)
 class Variant:
-    """One method of the paper.
+    """One method: ours, those that the paper compares it with, and those that go beyond it.
 
     Attributes:
       policy: its name in `jaxnew.policy.METHODS`, or the `package.module:NAME` of a user's own.
       has_fixed_set: trained with one set of actions that never changes.
       scores_fixed_set: it scores every action of that set, so that microbatches must be smaller.
-      is_without_entropy: its entropy coefficient is 0.
       is_continuous: its output is a point, not a choice.
+      minibatch_factor: times as many minibatches per pass as the budget has, where it can be
+        divided so.
+      changes: fields of the budget that differ, as `StageTwoBudget.vary` takes them.
     """
 
     policy: str
     has_fixed_set: bool = False
     scores_fixed_set: bool = False
-    is_without_entropy: bool = False
     is_continuous: bool = False
+    minibatch_factor: int = 1
+    changes: Mapping[str, Any] = field(default_factory=dict)
 
 
 VARIANTS = {
     "ours": Variant("ours"),
+    "modulated": Variant(
+        "modulated",
+        minibatch_factor=4,
+        changes={"network__state_width": 128, "hyperparameters__representation_noise": 0.2},
+    ),
     "no-subsampling": Variant("ours", has_fixed_set=True, scores_fixed_set=True),
-    "no-entropy": Variant("ours", is_without_entropy=True),
+    "no-entropy": Variant("ours", changes={"hyperparameters__entropy_coefficient": 0.0}),
     "continuous": Variant("continuous", is_continuous=True),
     "nearest-neighbour": Variant("discrete", has_fixed_set=True),
     "random": Variant("random"),
@@ -105,7 +115,8 @@ def trained_ids(name: str, task: Task, split: ActionSplit, part: str = "train") 
 def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -> StageTwoBudget:
     """The budget of a task as a method spends it."""
     variant = variant_of(name)
-    ppo, hyperparameters = budget.ppo, budget.hyperparameters
+    budget = budget.vary(**variant.changes)
+    ppo = budget.ppo
     if variant.is_continuous:
         share = task.baselines.continuous_rollout_share
         num_steps = round(ppo.rollout.num_steps * share)
@@ -117,10 +128,11 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
         ppo = replace(ppo, microbatch_size=min(size, ppo.microbatch_size))
     if variant.scores_fixed_set and task.baselines.fixed_set_minibatches:
         ppo = replace(ppo, num_minibatches=task.baselines.fixed_set_minibatches)
-    if variant.is_without_entropy:
-        hyperparameters = replace(hyperparameters, entropy_coefficient=0.0)
+    size, rest = divmod(ppo.minibatch_size, variant.minibatch_factor)
+    if not rest and not (ppo.microbatch_size and size % ppo.microbatch_size):
+        ppo = replace(ppo, num_minibatches=ppo.num_minibatches * variant.minibatch_factor)
     sets = replace(budget.sets, is_fixed=variant.has_fixed_set)
-    return replace(budget, ppo=ppo, sets=sets, hyperparameters=hyperparameters)
+    return replace(budget, ppo=ppo, sets=sets)
 
 
 def method_of(
@@ -131,18 +143,21 @@ def method_of(
     *,
     action_spec: ActionSpec | None = None,
     conditions_position: bool = False,
+    network: NetworkConfig | None = None,
 ) -> PolicyMethod:
     """The policy behind a variant that is trained with a part of the split.
 
     Args:
       action_spec: of the domain, for what comes with a choice there.
       conditions_position: see `MethodContext`.
+      network: sizes; None: the paper's.
     """
     context = MethodContext(
         train_ids=np.concatenate([split.always_available, trained_ids(name, task, split, part)]),
         sums_gaussian_entropy=task.baselines.sums_gaussian_entropy,
         action_spec=action_spec,
         conditions_position=conditions_position,
+        network=network or NetworkConfig(),
     )
     policy = variant_of(name).policy
     if ":" not in policy:

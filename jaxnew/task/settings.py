@@ -8,6 +8,7 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar, cast
 
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.ppo import Hyperparameters, PPOConfig
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.sampling import SetConfig
@@ -83,6 +84,7 @@ class TrainConfig:
       num_clusters: training sets are drawn from half of so many clusters of the representations;
         0 for the paper's runs, which draw from all actions.
       conditions_position: the position's head reads the chosen action.
+      network: sizes of the policy's networks.
       environment_version: see `Task`.
       environment: settings of the environment, of the type of `Task.environment`.
       pool: how environments on the host are run, of the type of `HostDomain.pool_settings`; no part
@@ -106,6 +108,7 @@ class TrainConfig:
     split_seed: int = 0
     num_clusters: int = 0
     conditions_position: bool = False
+    network: NetworkConfig = field(default_factory=NetworkConfig)
     environment_version: int = 0
     environment: Any = None
     pool: Any = None
@@ -247,8 +250,13 @@ def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
     if "ppo" not in recorded:
         model = {**config_lib.plain(RepresentationConfig()), **recorded.get("model", {})}
         return {"split_seed": 0, **recorded, "model": model}
-    added = {"split_seed": 0, "num_clusters": 0, "conditions_position": False}
+    added: dict[str, Any] = {"split_seed": 0, "num_clusters": 0, "conditions_position": False}
+    added["network"] = config_lib.plain(NetworkConfig())
     new: dict[str, Any] = {**added, "environment_version": 0, "environment": [], **recorded}
+    new["hyperparameters"] = {
+        **config_lib.plain(Hyperparameters()),
+        **new["hyperparameters"],
+    }
     rollout = dict(new["ppo"]["rollout"])
     if "set_size" in rollout:  # Until 2026-11-29 sets were part of the rollout.
         names = {"set_size": "size", "padded_set_size": "padded_size", "has_fixed_set": "is_fixed"}

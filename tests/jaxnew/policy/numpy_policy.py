@@ -1,4 +1,4 @@
-"""The utility policy in float64 NumPy, on parameters of `UtilityMethod`.
+"""Utility policies in float64 NumPy, on parameters of `UtilityMethod` and `ModulatedMethod`.
 
 Written from `docs/method.md`, "Policy networks".
 """
@@ -16,7 +16,7 @@ def dense(layer: dict[str, Any], x: np.ndarray) -> np.ndarray:
 
 
 def encode(layers: dict[str, Any], obs: np.ndarray) -> np.ndarray:
-    """`dense 64, tanh, dense 64, tanh`."""
+    """`dense, tanh, dense, tanh`."""
     hidden = np.tanh(dense(layers["Dense_0"], np.asarray(obs, np.float64)))
     return np.tanh(dense(layers["Dense_1"], hidden))
 
@@ -35,9 +35,24 @@ def utilities(params: dict[str, Any], obs: np.ndarray, representations: np.ndarr
     utility = params["utility"]
     features = encode(params["encoder"], obs)
     embedded = dense(utility["embed"], np.asarray(representations, np.float64))
-    features = np.broadcast_to(features[..., None, :], (*embedded.shape[:-1], 64))
+    features = np.broadcast_to(features[..., None, :], (*embedded.shape[:-1], features.shape[-1]))
     hidden = dense(utility, np.concatenate([features, embedded], axis=-1))
     return dense(utility["score"], np.maximum(hidden, 0.0))[..., 0]
+
+
+def modulated_utilities(
+    params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
+) -> np.ndarray:
+    """f64[..., m] as `utilities`, with h numbers in the hidden layer and w in f(s) and a:
+
+    a_i = ReLU( Lin(d,w)(c_i) );  u_i = Lin(w,h)(f(s)) . ReLU( Lin(2w,h)( [f(s), a_i] ) ).
+    """
+    utility = params["utility"]
+    features = encode(params["encoder"], obs)
+    embedded = np.maximum(dense(utility["embed"], np.asarray(representations, np.float64)), 0.0)
+    repeated = np.repeat(features[..., None, :], embedded.shape[-2], axis=-2)
+    hidden = np.maximum(dense(utility, np.concatenate([repeated, embedded], axis=-1)), 0.0)
+    return np.einsum("...h,...mh->...m", dense(utility["score"], features), hidden)
 
 
 def log_softmax(utility: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -10,13 +11,32 @@ import numpy as np
 import pytest
 
 from jaxnew.policy import METHODS, UtilityMethod, make_method
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.method import MethodContext
-from jaxnew.policy.utility import Utility
+from jaxnew.policy.utility import ModulatedMethod, ModulatedUtility, Utility
 from jaxnew.sampling import AvailableSet
 from tests.jaxnew.policy import numpy_policy
 
 NUM_FEATURES, D, M, BATCH = 81, 16, 12, 7
 METHOD = UtilityMethod()
+NETWORK = NetworkConfig(state_width=24, utility_width=40)
+# Each with its forward pass in NumPy.
+ORACLES = {
+    METHOD: numpy_policy.utilities,
+    UtilityMethod(NETWORK): numpy_policy.utilities,
+    ModulatedMethod(NETWORK): numpy_policy.modulated_utilities,
+}
+
+
+def named(method: UtilityMethod) -> str:
+    return f"{method.name}-{method.network.state_width}-{method.network.utility_width}"
+
+
+@pytest.fixture(scope="module", params=list(ORACLES), ids=named)
+def method(request: pytest.FixtureRequest) -> UtilityMethod:
+    chosen: UtilityMethod = request.param
+    return chosen
+
 
 # float32 sums of up to 128 products of order-one numbers: a few spacings of 1e-7 each.
 TOLERANCE = {"rtol": 2e-5, "atol": 2e-5}
@@ -28,8 +48,10 @@ def fresh() -> dict[str, Any]:
 
 
 @pytest.fixture(scope="module")
-def params(fresh: dict[str, Any]) -> dict[str, Any]:
-    return numpy_policy.randomized(fresh, seed=1)
+def params(method: UtilityMethod) -> dict[str, Any]:
+    init = functools.partial(method.init, representation_size=D)
+    shapes = jax.eval_shape(init, jax.random.key(0), jnp.zeros(NUM_FEATURES))
+    return numpy_policy.randomized(shapes, seed=1)
 
 
 @pytest.fixture(scope="module")
@@ -44,11 +66,13 @@ def inputs() -> dict[str, np.ndarray]:
     }
 
 
-@jax.jit
-def log_probs(params: Any, obs: Any, representations: Any, mask: Any) -> jax.Array:
+@functools.partial(jax.jit, static_argnums=0)
+def log_probs(
+    method: UtilityMethod, params: Any, obs: Any, representations: Any, mask: Any
+) -> jax.Array:
     """f32[..., m] of every choice."""
-    projected = METHOD.project(params, representations)
-    distribution = METHOD.distribution(params, obs, projected, mask)
+    projected = method.project(params, representations)
+    distribution = method.distribution(params, obs, projected, mask)
     choices = jnp.arange(mask.shape[-1])
     return jnp.stack(
         [distribution.log_prob(jnp.full(mask.shape[:-1], c)) for c in choices], axis=-1
@@ -56,9 +80,11 @@ def log_probs(params: Any, obs: Any, representations: Any, mask: Any) -> jax.Arr
 
 
 @pytest.mark.oracle
-def test_policy_equals_the_numpy_forward_pass(params: Any, inputs: Any) -> None:
-    got = np.asarray(log_probs(params, **inputs))
-    utilities = numpy_policy.utilities(params, inputs["obs"], inputs["representations"])
+def test_policy_equals_the_numpy_forward_pass(
+    method: UtilityMethod, params: Any, inputs: Any
+) -> None:
+    got = np.asarray(log_probs(method, params, **inputs))
+    utilities = ORACLES[method](params, inputs["obs"], inputs["representations"])
     assert utilities.std() > 0.5  # Scores that differ, or the comparison says little.
     expected = numpy_policy.log_softmax(utilities, inputs["mask"])
     mask = inputs["mask"]
@@ -67,24 +93,27 @@ def test_policy_equals_the_numpy_forward_pass(params: Any, inputs: Any) -> None:
 
 
 @pytest.mark.oracle
-def test_value_equals_the_numpy_forward_pass(params: Any, inputs: Any) -> None:
-    got = METHOD.value(params, inputs["obs"])
+def test_value_equals_the_numpy_forward_pass(
+    method: UtilityMethod, params: Any, inputs: Any
+) -> None:
+    got = method.value(params, inputs["obs"])
     assert got.shape == (BATCH,)
     np.testing.assert_allclose(got, numpy_policy.value(params, inputs["obs"]), **TOLERANCE)
 
 
 @pytest.mark.property
 @pytest.mark.parametrize("d", [1, 16, 128])
-def test_the_factored_form_is_the_concatenated_form(d: int) -> None:
-    """The same sum over 128 products in another order; hence float32 roundings only."""
-    utility = Utility()
-    features = jax.random.normal(jax.random.key(3), (BATCH, 64))
+@pytest.mark.parametrize("kind", [Utility, ModulatedUtility])
+def test_the_factored_form_is_the_concatenated_form(kind: type[Utility], d: int) -> None:
+    """The same sum over products in another order; hence float32 roundings only."""
+    utility = kind(NETWORK)
+    features = jax.random.normal(jax.random.key(3), (BATCH, NETWORK.state_width))
     representations = jax.random.normal(jax.random.key(4), (BATCH, M, d))
     shapes = utility.init(jax.random.key(5), features, representations, method="concatenated")
     variables = numpy_policy.randomized(shapes, seed=6)
     paper = utility.apply(variables, features, representations, method="concatenated")
     projected = utility.apply(variables, representations, method="project")
-    assert projected.shape == (BATCH, M, 64)
+    assert projected.shape == (BATCH, M, NETWORK.utility_width)
     np.testing.assert_allclose(utility.apply(variables, features, projected), paper, **TOLERANCE)
     # The projection of a whole table and gathering of rows commute.
     rows = np.array([3, 0, 3])
@@ -96,7 +125,9 @@ def test_the_factored_form_is_the_concatenated_form(d: int) -> None:
 
 
 @pytest.mark.property
-def test_permuting_the_set_permutes_the_choices(params: Any, inputs: Any) -> None:
+def test_permuting_the_set_permutes_the_choices(
+    method: UtilityMethod, params: Any, inputs: Any
+) -> None:
     order = np.random.default_rng(7).permutation(M)
     permuted = {
         "obs": inputs["obs"],
@@ -104,28 +135,30 @@ def test_permuting_the_set_permutes_the_choices(params: Any, inputs: Any) -> Non
         "mask": inputs["mask"][:, order],
     }
     np.testing.assert_allclose(
-        log_probs(params, **permuted), log_probs(params, **inputs)[:, order], **TOLERANCE
+        log_probs(method, params, **permuted),
+        log_probs(method, params, **inputs)[:, order],
+        **TOLERANCE,
     )
 
 
 @pytest.mark.property
-def test_padding_is_not_seen(params: Any, inputs: Any) -> None:
+def test_padding_is_not_seen(method: UtilityMethod, params: Any, inputs: Any) -> None:
     """Not its rows, not their number: also where a padded row would win."""
     mask = np.broadcast_to(np.arange(M) < 8, (BATCH, M))
     inputs = {**inputs, "mask": mask}
-    padded = np.asarray(log_probs(params, **inputs))
+    padded = np.asarray(log_probs(method, params, **inputs))
     others = inputs["representations"].copy()
     others[:, 8:] = 1e3
-    changed = np.asarray(log_probs(params, **{**inputs, "representations": others}))
+    changed = np.asarray(log_probs(method, params, **{**inputs, "representations": others}))
     assert np.array_equal(changed[:, :8], padded[:, :8])
     bare = log_probs(
-        params, inputs["obs"], inputs["representations"][:, :8], np.ones((BATCH, 8), bool)
+        method, params, inputs["obs"], inputs["representations"][:, :8], np.ones((BATCH, 8), bool)
     )
     np.testing.assert_allclose(padded[:, :8], bare, **TOLERANCE)
 
     def entropy(representations: jax.Array) -> jax.Array:
-        projected = METHOD.project(params, representations)
-        return jnp.sum(METHOD.distribution(params, inputs["obs"], projected, mask).entropy())
+        projected = method.project(params, representations)
+        return jnp.sum(method.distribution(params, inputs["obs"], projected, mask).entropy())
 
     grad = np.asarray(jax.grad(entropy)(jnp.asarray(inputs["representations"])))
     assert (grad[:, 8:] == 0).all()
@@ -191,21 +224,34 @@ def test_initial_weights_are_orthogonal_with_the_gains_of_the_spec(fresh: Any) -
 
 
 @pytest.mark.property
-def test_initial_policy_is_almost_uniform(fresh: Any, inputs: Any) -> None:
-    """|f| <= 8 (64 tanhs), so |hidden| <= 0.01 * (8 + 0.01 |c|) and |u| <= 0.01 |hidden| < 1e-3 for
-    |c| < 100: log-probabilities within 2e-3 of -ln m."""
+@pytest.mark.parametrize(
+    ("kind", "bound"),
+    [
+        # |f| <= 8 (64 tanhs), so |hidden| <= 0.01 * (8 + 0.01 |c|) and |u| <= 0.01 |hidden| < 1e-3
+        # for |c| < 100: log-probabilities within 2e-3 of -ln m.
+        (UtilityMethod, 2e-3),
+        # |hidden| <= 1.5 * (8 + 1.5 |c|) < 30 for |c| < 8, and its weights 0.01 |f| <= 0.08; these
+        # have random signs: a few of 30 * 0.08 / 64 ** 0.5.
+        (ModulatedMethod, 0.5),
+    ],
+)
+def test_initial_policy_is_almost_uniform(
+    kind: type[UtilityMethod], bound: float, inputs: Any
+) -> None:
+    method = kind()
+    fresh = method.init(jax.random.key(0), jnp.zeros(NUM_FEATURES), D)
     inputs = {**inputs, "mask": np.ones((BATCH, M), bool)}
-    got = np.asarray(log_probs(fresh, **inputs))
-    assert np.abs(got + np.log(M)).max() < 2e-3
+    got = np.asarray(log_probs(method, fresh, **inputs))
+    assert np.abs(got + np.log(M)).max() < bound
     assert got.std() > 0  # ... but not exactly.
 
 
 @pytest.mark.unit
-def test_actor_and_critic_share_nothing(params: Any, inputs: Any) -> None:
+def test_actor_and_critic_share_nothing(method: UtilityMethod, params: Any, inputs: Any) -> None:
     @jax.jit
     def gradients(params: Any) -> tuple[Any, Any]:
-        value_grad = jax.grad(lambda p: jnp.sum(METHOD.value(p, inputs["obs"])))(params)
-        policy_grad = jax.grad(lambda p: log_probs(p, **inputs)[:, 4].sum())(params)
+        value_grad = jax.grad(lambda p: jnp.sum(method.value(p, inputs["obs"])))(params)
+        policy_grad = jax.grad(lambda p: log_probs(method, p, **inputs)[:, 4].sum())(params)
         return value_grad, policy_grad
 
     value_grad, policy_grad = gradients(params)
