@@ -57,6 +57,7 @@ def plain_config(
         "split_seed": 0,
         "num_clusters": 0,
         "conditions_position": False,
+        "network": config_lib.to_dict(budget.network),
         "environment": config_lib.plain(TASK.environment),
     }
 

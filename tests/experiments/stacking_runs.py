@@ -69,6 +69,7 @@ OTHERS = {
     "no-subsampling": Run("-2d-place", "no-subsampling", EMBED.format("vae-oracle")),
     "continuous": Run(method="continuous", representation="mine.npz"),
     "random": Run("-no-place", "random"),
+    "modulated": Run(method="modulated", flags=SHORT),
 }
 RUNS = ALIKE | OTHERS
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
@@ -25,6 +26,7 @@ SIZES = {
     ("grid_world", "no-subsampling", "gt12"): (512, 50),
     ("grid_world", "no-entropy", "random-12"): (50, 50),
     ("grid_world", "random", "gt12"): (50, 50),
+    ("grid_world", "modulated", "gt12"): (50, 50),
     ("recommender", "ours", "product"): (50, 50),
 }
 FULL = ("recommender", "nearest-neighbour", "product-mu")
@@ -117,6 +119,24 @@ def test_what_each_method_changes() -> None:
         assert all(abs(s - steps["ours"]) <= paper.ppo.steps_per_update for s in steps.values())
     with pytest.raises(UsageError, match=r"Unknown method 'our'\. Methods: ours, "):
         variant_of("our")
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", [*TASKS, "create-push", "shape_stacking"])
+def test_what_a_modulated_utility_is_trained_with(name: str) -> None:
+    """docs/method.md, "Modulated utility": as many steps, four times as many gradient steps."""
+    domain = Domain.of(load_task(name), None)
+    for budget_name, budget in domain.task.stage_two.items():
+        found = adapted(budget, "modulated", domain.task, domain.split)
+        assert (found.network.state_width, found.network.utility_width) == (128, 64)
+        assert found.hyperparameters.representation_noise == 0.2
+        assert found.num_updates == budget.num_updates
+        assert found.ppo.steps_per_update == budget.ppo.steps_per_update
+        # Two environments of 11 steps cannot be divided by eight.
+        is_odd = (name, budget_name) == ("shape_stacking", "smoke")
+        times = 1 if is_odd else 4
+        assert found.ppo.num_minibatches == times * budget.ppo.num_minibatches
+        assert budget.network == NetworkConfig()
 
 
 @pytest.mark.unit

@@ -391,6 +391,34 @@ def test_a_growing_set_is_the_beginning_of_the_whole_one() -> None:
     assert np.asarray(unchanging.mask).sum(axis=1).tolist() == [2] * 4
 
 
+@pytest.mark.property
+def test_noise_is_as_wide_as_what_sets_are_drawn_from() -> None:
+    """Rows of other actions have noise, but no say in how much: a policy may not know them."""
+    rng = np.random.default_rng(0)
+    scale = np.array([0.1, 1.0, 30.0], np.float32)
+    table = (rng.normal(size=(4000, 3)) * scale + 7.0).astype(np.float32)
+    ids = np.arange(0, 2000, 2)
+    table[2000:] *= 1e3
+    actions = Actions.of(table, ids, 50)
+    perturbed = jax.jit(Actions.perturbed)
+    moved = np.asarray(perturbed(actions, jax.random.key(0), 0.2).table) - table
+    # Means and deviations of 2,000 normal numbers: within 4 of their own deviations.
+    wanted = 0.2 * table[ids].std(axis=0)
+    np.testing.assert_allclose(moved[:2000].std(axis=0), wanted, rtol=4 / math.sqrt(2 * 2000))
+    assert (np.abs(moved[:2000].mean(axis=0)) < 4 * wanted / math.sqrt(2000)).all()
+    assert np.abs(moved[2000:]).max() < 6 * wanted.max()
+    assert np.abs(np.corrcoef(moved[:2000].T) - np.eye(3)).max() < 4 / math.sqrt(2000)
+    other = np.asarray(perturbed(actions, jax.random.key(1), 0.2).table) - table
+    assert not np.isclose(other[:2000], moved[:2000]).any(axis=1).all()
+    still = perturbed(actions, jax.random.key(0), 0.0)
+    np.testing.assert_array_equal(still.table, table)
+    many = jax.vmap(lambda noise: actions.perturbed(jax.random.key(0), noise).table)(
+        jnp.array([0.0, 0.2])
+    )
+    np.testing.assert_array_equal(many[0], table)
+    np.testing.assert_allclose(many[1] - table, moved, rtol=1e-3, atol=1e-2)
+
+
 @pytest.mark.unit
 def test_actions_that_cannot_be_are_refused() -> None:
     with pytest.raises(ValueError, match=r"Sets of 8 .* from the test actions, .* 7 \(0 "):

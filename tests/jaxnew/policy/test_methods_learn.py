@@ -64,6 +64,12 @@ def test_ours_generalizes() -> None:
     assert ours["held out"] > 0.8
 
 
+def test_a_modulated_utility_generalizes_as_well() -> None:
+    modulated = success("modulated", False)
+    assert modulated["train"] > 0.85
+    assert modulated["held out"] > 0.8
+
+
 def test_random_play_is_chance() -> None:
     found = success("random", False)
     assert found["train"] == pytest.approx(0.3, abs=0.06)  # 4 deviations of 1,024 choices.

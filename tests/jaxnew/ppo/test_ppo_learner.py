@@ -321,6 +321,23 @@ def test_two_updates_are_one_and_one_bit_for_bit() -> None:
 
 
 @pytest.mark.property
+def test_what_acted_with_noise_is_learned_from_with_the_same_noise() -> None:
+    """One gradient step: its ratios of probabilities are 1, unless it sees another table."""
+    config = replace(CONFIG, num_epochs=1, num_minibatches=1)
+    learner = learner_of(config)
+    update = jax.jit(learner.update)
+    fresh = initial_state(0)
+    state = replace(fresh, params=numpy_policy.randomized(fresh.params, seed=1))
+    noisy = replace(HP, representation_noise=0.5)
+    (clean, _), (moved, metrics) = (update(state, hp, ACTIONS) for hp in (HP, noisy))
+    assert abs(metrics["policy/approximate_kl"]) < 1e-6
+    assert not all(np.array_equal(a, b) for a, b in zip(plain(clean), plain(moved), strict=True))
+    again, _ = update(state, noisy, ACTIONS)
+    for a, b in zip(plain(moved), plain(again), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.property
 def test_updates_are_the_same_however_they_are_run() -> None:
     """Three in one compiled call and three compiled calls: bit for bit. One member under `vmap`
     is another program, whose roundings Adam's eps dampens: to 1e-5, a hundredth of a step."""
@@ -440,6 +457,7 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
         "discount": 0.99,
         "gae_lambda": 0.95,
         "value_coefficient": 0.5,
+        "representation_noise": 0.0,
     }
     assert (config.rollout.num_envs, config.rollout.num_steps) == (32, 512)
     assert (config.num_epochs, config.num_minibatches, config.minibatch_size) == (4, 4, 4096)

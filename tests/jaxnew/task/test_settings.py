@@ -85,6 +85,7 @@ CHOICES = {
     "num_updates": st.integers(1, 10**9),
     "num_clusters": st.integers(0, 50),
     "conditions_position": st.booleans(),
+    "network.state_width": st.integers(1, 999),
     "ppo.num_epochs": st.integers(1, 9),
     "ppo.max_grad_norm": numbers,
     "ppo.rollout.normalize_rewards": st.booleans(),
@@ -93,6 +94,7 @@ CHOICES = {
     "hyperparameters.learning_rate": st.floats(0, 1),
     "hyperparameters.entropy_coefficient": st.floats(0, 1e9),
     "hyperparameters.discount": st.floats(0, 1),
+    "hyperparameters.representation_noise": numbers,
     "loop.evaluate_every": st.integers(1, 99),
     "loop.evaluation_set_size": st.integers(0, 99),
     "environment.time_limit": st.integers(1, 9),
@@ -169,6 +171,9 @@ def test_what_follows_says_from_what(path: str, says: str) -> None:
         ({"hyperparameters.entropy_coefficient": -1.0}, "entropy_coefficient=-1.0 must be at"),
         ({"hyperparameters.value_coefficient": -1.0}, "value_coefficient=-1.0 must be at least 0"),
         ({"hyperparameters.clip": float("nan")}, "must be a finite float"),
+        ({"hyperparameters.representation_noise": -0.1}, "representation_noise=-0.1 must be at"),
+        ({"network.state_width": 0}, "state_width=0 must be at least 1"),
+        ({"network.utility_width": -3}, "utility_width=-3 must be at least 1"),
         ({"num_updates": 0}, "num_updates=0 must be at least 1"),
         ({"num_clusters": -1}, "num_clusters=-1 must be at least 0"),
         ({"num_clusters": 3, "sets.is_fixed": True}, "num_clusters=3 needs sets that are drawn"),
@@ -408,6 +413,8 @@ def test_configs_of_the_revision_before_are_read(recorded: dict[str, Any]) -> No
     assert differences(upgraded(recorded), identity(expected)) == []
     assert read_train_config(recorded, task) == (expected, task)
     assert json.dumps(recorded) == before, "what was read is left alone"
+    assert "network" not in recorded
+    assert "representation_noise" not in recorded["hyperparameters"]
     older = {k: v for k, v in recorded.items() if k not in ("num_clusters", "conditions_position")}
     assert upgraded(older) == upgraded(recorded)
     if not recorded["environment"]:
