@@ -65,7 +65,7 @@ class AttentionMethod:
     def __init__(self, context: MethodContext) -> None:
         self._width = context.network.state_width
         self._encoder = StateEncoder(self._width)
-        self._critic = StateCritic(self._width)
+        self._critic = StateCritic(context.network.critic_width)
         self._utility = SetUtility()
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:

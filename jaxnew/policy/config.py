@@ -10,8 +10,9 @@ class NetworkConfig:
     """Sizes of a policy's networks; the defaults are the paper's.
 
     Attributes:
-      state_width: of the state feature f(s), of the layers in front of it and of the critic's, and
-        of an action's embedding.
+      state_width: of the state feature f(s), of the layers in front of it, and of an action's
+        embedding.
+      critic_width: of the critic's own layers, for states that are vectors.
       utility_width: of the hidden layer in which a state meets an action.
 
     Raises:
@@ -20,6 +21,7 @@ class NetworkConfig:
     """
 
     state_width: int = 64
+    critic_width: int = 64
     utility_width: int = 64
 
     def __post_init__(self) -> None:

@@ -130,7 +130,7 @@ class StateCritic(nn.Module):
     gradient reaches.
     """
 
-    width: int = NetworkConfig.state_width
+    width: int = NetworkConfig.critic_width
 
     @nn.compact
     def __call__(self, obs: jax.Array, features: jax.Array) -> jax.Array:
@@ -154,7 +154,7 @@ class FeatureMethod:
 
     def __init__(self, network: NetworkConfig | None = None) -> None:
         self.network = network or NetworkConfig()
-        self._critic = StateCritic(self.network.state_width)
+        self._critic = StateCritic(self.network.critic_width)
 
     def init_critic(self, key: jax.Array, obs: jax.Array) -> Any:
         """Fresh parameters of the critic; consumes `key`."""

@@ -19,7 +19,7 @@ from tests.jaxnew.policy import numpy_policy
 
 NUM_FEATURES, D, M, BATCH = 81, 16, 12, 7
 METHOD = UtilityMethod()
-NETWORK = NetworkConfig(state_width=24, utility_width=40)
+NETWORK = NetworkConfig(state_width=24, critic_width=16, utility_width=40)
 # Each with its forward pass in NumPy.
 ORACLES = {
     METHOD: numpy_policy.utilities,
