@@ -27,7 +27,8 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
-_LENGTH = 1.25  # Its steps, in those of the budget: what ten minutes on two cores allow.
+_METHOD = "modulated"
+_LENGTH = 0.75  # Its steps, in those of the budget: what ten minutes on two cores allow.
 
 
 def main() -> int | None:
@@ -39,6 +40,7 @@ def main() -> int | None:
     run = train(
         task,
         encoder.table,
+        method=_METHOD,
         budget=budget,
         set={
             "num_updates": num_updates,

@@ -25,7 +25,7 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
     "method": (
         "string",
         "ours",
-        "ours, no-entropy, no-subsampling, continuous, nearest-neighbour, random, or "
+        "ours, modulated, no-entropy, no-subsampling, continuous, nearest-neighbour, random, or "
         "package.module:NAME of a callable (MethodContext) -> PolicyMethod.",
     ),
     "representation": (

@@ -28,6 +28,7 @@ _HOMES = {
     "Hyperparameters": "jaxnew.ppo",
     "Learner": "jaxnew.ppo",
     "MethodContext": "jaxnew.policy.method",
+    "NetworkConfig": "jaxnew.policy.config",
     "PPOConfig": "jaxnew.ppo",
     "Policy": "jaxnew.rollout.contract",
     "PolicyMethod": "jaxnew.policy.method",

@@ -10,6 +10,7 @@ from jaxnew.environment import Action as Action
 from jaxnew.environment import Environment as Environment
 from jaxnew.environment import FixedActionSet as FixedActionSet
 from jaxnew.observations import Recordings as Recordings
+from jaxnew.policy.config import NetworkConfig as NetworkConfig
 from jaxnew.policy.method import MethodContext as MethodContext
 from jaxnew.policy.method import PolicyMethod as PolicyMethod
 from jaxnew.policy.method import make_method as make_method

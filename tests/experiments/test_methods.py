@@ -12,7 +12,7 @@ from jaxnew.storage import metrics
 from jaxnew.task.domain import Domain, load_task
 from jaxnew.task.methods import VARIANTS, adapted, trained_ids, variant_of
 from jaxnew.task.places import UsageError
-from tests.experiments.commands import OPTIMIZED, evaluation, read_json, run, run_alone
+from tests.experiments.commands import OPTIMIZED, ROOT, evaluation, read_json, run, run_alone
 from tests.experiments.several import run_several
 
 TASKS = ("grid_world", "recommender")
@@ -117,6 +117,8 @@ def test_what_each_method_changes() -> None:
             assert found[fixed].num_updates == paper.num_updates
         steps = {m: b.num_updates * b.ppo.steps_per_update for m, b in found.items()}
         assert all(abs(s - steps["ours"]) <= paper.ppo.steps_per_update for s in steps.values())
+    helped = (ROOT / "docs" / "commands" / "train.md").read_text()
+    assert all(f" {name}," in helped for name in VARIANTS)
     with pytest.raises(UsageError, match=r"Unknown method 'our'\. Methods: ours, "):
         variant_of("our")
 
