@@ -65,11 +65,14 @@ OTHERS = {
         representation=EMBED.format("hvae-oracle"),
         flags=(*SHORT, "--set=conditions_position=true"),
     ),
-    "clusters": Run(representation=EMBED.format("vae"), flags=(*SHORT, "--set=num_clusters=10")),
+    "clusters": Run(
+        method="modulated",
+        representation=EMBED.format("vae"),
+        flags=(*SHORT, "--set=num_clusters=10"),
+    ),
     "no-subsampling": Run("-2d-place", "no-subsampling", EMBED.format("vae-oracle")),
     "continuous": Run(method="continuous", representation="mine.npz"),
     "random": Run("-no-place", "random"),
-    "modulated": Run(method="modulated", flags=SHORT),
 }
 RUNS = ALIKE | OTHERS
 

@@ -77,7 +77,7 @@ OTHERS = {
     "belt": Run("create-belt", "no-entropy"),
     "buckets": Run("create-buckets", "random"),
     "basket": Run("create-basket", "no-subsampling"),
-    "funnel": Run("create-funnel", representation="random-32"),
+    "funnel": Run("create-funnel", "modulated", "random-32"),
     "conditioned": Run("create-push", flags=(*SHORT, "--set=conditions_position=true")),
     "no-subgoals": Run("create-push-no-subgoals"),
     "full": Run("create-push", flags=(*SHORT, "--split=full"), split="full"),

@@ -14,6 +14,7 @@ from jaxnew.environment import ActionSpec
 from jaxnew.evaluation import measure
 from jaxnew.policy import Categorical, make_method
 from jaxnew.policy.auxiliary import AuxiliaryMethod, HybridDistribution, HybridSample
+from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.distributions import Beta
 from jaxnew.policy.method import MethodContext
 from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
@@ -33,12 +34,15 @@ SETS = AvailableSet(
 )
 
 
+KINDS = [("ours", False), ("ours", True), ("modulated", True)]
+
+
 def method_of(
     name: str = "ours", is_conditioned: bool = False, spec: ActionSpec = SPEC
 ) -> AuxiliaryMethod:
-    context = MethodContext(
-        train_ids=TRAIN_IDS, action_spec=spec, conditions_position=is_conditioned
-    )
+    # Widths that differ from each other, where the paper's are all alike.
+    network = NetworkConfig(24, 16, 40) if name == "modulated" else NetworkConfig()
+    context = MethodContext(TRAIN_IDS, False, spec, is_conditioned, network)
     method = make_method(name, context)
     assert isinstance(method, AuxiliaryMethod)
     return method
@@ -99,9 +103,9 @@ def test_samples_and_gradients_are_finite_at_the_ends() -> None:
 
 
 @pytest.mark.oracle
-@pytest.mark.parametrize("is_conditioned", [False, True])
-def test_joint_log_prob_and_entropy_are_sums_of_the_parts(is_conditioned: bool) -> None:
-    method = method_of(is_conditioned=is_conditioned)
+@pytest.mark.parametrize(("name", "is_conditioned"), KINDS)
+def test_joint_log_prob_and_entropy_are_sums_of_the_parts(name: str, is_conditioned: bool) -> None:
+    method = method_of(name, is_conditioned)
     distribution = distribution_of(method, moved(method.init(jax.random.key(0), OBS[0], D)))
     sample = distribution.sample(jax.random.key(2))
     rows = np.arange(N)
@@ -162,9 +166,9 @@ def test_the_conditioned_head_is_the_one_of_the_paper() -> None:
 
 
 @pytest.mark.property
-@pytest.mark.parametrize("is_conditioned", [False, True])
-def test_the_order_of_a_set_and_its_padding_do_not_matter(is_conditioned: bool) -> None:
-    method = method_of(is_conditioned=is_conditioned)
+@pytest.mark.parametrize(("name", "is_conditioned"), KINDS)
+def test_the_order_of_a_set_and_its_padding_do_not_matter(name: str, is_conditioned: bool) -> None:
+    method = method_of(name, is_conditioned)
     params = moved(method.init(jax.random.key(0), OBS[0], D))
     sample = distribution_of(method, params).sample(jax.random.key(2))
     order = np.array([3, 0, 4, 1, 2])
@@ -194,7 +198,7 @@ def test_the_order_of_a_set_and_its_padding_do_not_matter(is_conditioned: bool) 
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("name", ["ours", "continuous", "discrete", "random"])
+@pytest.mark.parametrize("name", ["ours", "modulated", "continuous", "discrete", "random"])
 def test_every_method_gets_heads_beside_its_own_parameters(name: str) -> None:
     plain = make_method(name, MethodContext(train_ids=TRAIN_IDS))
     method = method_of(name)
@@ -202,8 +206,8 @@ def test_every_method_gets_heads_beside_its_own_parameters(name: str) -> None:
     plain_tree = jax.tree.structure(plain.init(jax.random.key(0), OBS[0], D))
     heads = params.pop("auxiliary")["heads"]
     assert jax.tree.structure(params) == plain_tree
-    # 64 x 2 + 2 each for stop, alpha, beta (k = 2).
-    assert sum(x.size for x in jax.tree.leaves(heads)) == 3 * (64 * 2 + 2)
+    # w x 2 + 2 each for stop, alpha, beta (k = 2).
+    assert sum(x.size for x in jax.tree.leaves(heads)) == 3 * (method.network.state_width * 2 + 2)
     params["auxiliary"] = {"heads": heads}
     distribution = distribution_of(method, params)
     sample = distribution.sample(jax.random.key(1))
@@ -220,9 +224,9 @@ def test_every_method_gets_heads_beside_its_own_parameters(name: str) -> None:
 
 
 @pytest.mark.unit
-@pytest.mark.parametrize("is_conditioned", [False, True])
-def test_the_gradient_reaches_every_parameter(is_conditioned: bool) -> None:
-    method = method_of(is_conditioned=is_conditioned)
+@pytest.mark.parametrize(("name", "is_conditioned"), KINDS)
+def test_the_gradient_reaches_every_parameter(name: str, is_conditioned: bool) -> None:
+    method = method_of(name, is_conditioned)
     params = moved(method.init(jax.random.key(0), OBS[0], D))
     sample = distribution_of(method, params).sample(jax.random.key(2))
 
@@ -237,7 +241,7 @@ def test_the_gradient_reaches_every_parameter(is_conditioned: bool) -> None:
         if not np.abs(g).max() > 1e-4
     ]
     # A softmax does not feel what is added to all utilities.
-    assert silent == ["['utility']['score']['bias']"]
+    assert silent == (["['utility']['score']['bias']"] if name == "ours" else [])
 
 
 @pytest.mark.unit
