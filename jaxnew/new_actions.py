@@ -161,7 +161,7 @@ def _moved(
         for part in ("train", "validation", "test", "always_available")
     }
     task = with_settings(task, config)
-    method = policy_of(config, task, replace(split, **behind))
+    method = policy_of(config, task, replace(split, **behind), split, trainer.table)
     rollout = rollout_of(task, method, config.ppo, config.seed, trainer.num_workers)
     moved = replace(
         trainer,

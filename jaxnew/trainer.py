@@ -19,7 +19,7 @@ from jaxnew.rollout.contract import Rollout
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.rollout.host import HostRollout
 from jaxnew.sampling import Actions
-from jaxnew.task.methods import method_of, trained_ids
+from jaxnew.task.methods import learned_ids, method_of, trained_ids
 from jaxnew.task.settings import TrainConfig, with_settings
 from jaxnew.task.task import Task
 
@@ -65,7 +65,7 @@ class Trainer:
           ValueError: unknown method, or sets larger than the train or validation pool.
         """
         task = with_settings(task, config)
-        method = policy_of(config, task, split)
+        method = policy_of(config, task, split, split, table)
         rollout = rollout_of(task, method, config.ppo, config.seed, num_workers)
         vectors = jax.numpy.asarray(table.rows(np.arange(len(table.ids))))
         always = split.always_available
@@ -184,16 +184,29 @@ def _drawn(training: Actions) -> Actions:
     return replace(training, is_fixed=False, padded_size=training.set_size)
 
 
-def policy_of(config: TrainConfig, task: Task, split: ActionSplit) -> PolicyMethod:
-    """The policy of a run, before it has parameters."""
+def policy_of(
+    config: TrainConfig,
+    task: Task,
+    acting: ActionSplit,
+    split: ActionSplit,
+    table: RepresentationTable,
+) -> PolicyMethod:
+    """The policy of a run, before it has parameters.
+
+    Args:
+      acting: the run's split, by the ids that its actions have where the policy acts.
+      split, table: the run's own.
+    """
+    learned = learned_ids(config.method, task, split, config.trained_on)
     return method_of(
         config.method,
         task,
-        split,
+        acting,
         config.trained_on,
         action_spec=task.action_spec,
         conditions_position=config.conditions_position,
         network=config.network,
+        representations=table.rows(learned),
     )
 
 

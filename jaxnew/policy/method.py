@@ -112,6 +112,8 @@ class MethodContext:
       action_spec: of the domain; what comes with a choice there gets heads. None: nothing does.
       conditions_position: the position's head reads the chosen action too.
       network: sizes.
+      representations: f32[n, d] of the actions that are trained with, whose units a method may
+        take; None: unknown.
     """
 
     train_ids: np.ndarray = field(default_factory=lambda: np.zeros(0, np.int32))
@@ -119,11 +121,12 @@ class MethodContext:
     action_spec: ActionSpec | None = None
     conditions_position: bool = False
     network: NetworkConfig = field(default_factory=NetworkConfig)
+    representations: np.ndarray | None = None
 
 
 METHODS: dict[str, Callable[[MethodContext], PolicyMethod]] = {
     "ours": lambda context: UtilityMethod(context.network),
-    "modulated": lambda context: ModulatedMethod(context.network),
+    "modulated": lambda context: ModulatedMethod(context.network, context.representations),
     "continuous": lambda context: ContinuousMethod(context.sums_gaussian_entropy, context.network),
     "discrete": lambda context: DiscreteMethod(context.train_ids, context.network),
     "random": lambda context: RandomMethod(context.network),

@@ -21,6 +21,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxnew.environment import Action
 from jaxnew.policy.config import NetworkConfig
@@ -176,10 +177,37 @@ class UtilityMethod(FeatureMethod):
 
 
 class ModulatedMethod(UtilityMethod):
-    """A utility policy with a `ModulatedUtility`."""
+    """A utility policy with a `ModulatedUtility`, which reads representations in their own unit.
+
+    That is less their mean, over their deviation: one number, so that the shape of their space
+    stays.
+
+    Args:
+      network: sizes.
+      representations: f32[n, d] those that have the unit; None: they are read as they are.
+    """
 
     name = "modulated"
     utility_type = ModulatedUtility
+
+    def __init__(
+        self,
+        network: NetworkConfig | None = None,
+        representations: np.ndarray | None = None,
+    ) -> None:
+        super().__init__(network)
+        seen = np.zeros(1) if representations is None else np.asarray(representations, np.float64)
+        self._mean = np.float32(seen.mean(axis=0))
+        deviation = np.sqrt(seen.var(axis=0).mean())
+        self._unit = np.float32(deviation if deviation > 0 else 1.0)
+
+    def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., h]: all that the policy needs of an action, in any state."""
+        return super().project(params, (representations - self._mean) / self._unit)
+
+    def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
+        """f32[..., d] -> f32[..., w]: the `a` of the utility."""
+        return super().embed(params, (representations - self._mean) / self._unit)
 
 
 class RandomMethod(UtilityMethod):

@@ -112,6 +112,11 @@ def trained_ids(name: str, task: Task, split: ActionSplit, part: str = "train") 
     return task.baselines.fixed_set(ids) if variant_of(name).scores_fixed_set else ids
 
 
+def learned_ids(name: str, task: Task, split: ActionSplit, part: str = "train") -> np.ndarray:
+    """int32[n] the same, and before them those that are always available."""
+    return np.concatenate([split.always_available, trained_ids(name, task, split, part)])
+
+
 def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -> StageTwoBudget:
     """The budget of a task as a method spends it."""
     variant = variant_of(name)
@@ -144,6 +149,7 @@ def method_of(
     action_spec: ActionSpec | None = None,
     conditions_position: bool = False,
     network: NetworkConfig | None = None,
+    representations: np.ndarray | None = None,
 ) -> PolicyMethod:
     """The policy behind a variant that is trained with a part of the split.
 
@@ -151,13 +157,15 @@ def method_of(
       action_spec: of the domain, for what comes with a choice there.
       conditions_position: see `MethodContext`.
       network: sizes; None: the paper's.
+      representations: see `MethodContext`.
     """
     context = MethodContext(
-        train_ids=np.concatenate([split.always_available, trained_ids(name, task, split, part)]),
+        train_ids=learned_ids(name, task, split, part),
         sums_gaussian_entropy=task.baselines.sums_gaussian_entropy,
         action_spec=action_spec,
         conditions_position=conditions_position,
         network=network or NetworkConfig(),
+        representations=representations,
     )
     policy = variant_of(name).policy
     if ":" not in policy:

@@ -38,7 +38,7 @@ def encoder(tmp_path_factory: pytest.TempPathFactory) -> Encoder:
     return embed(LADDER, "hvae", budget="smoke", runs=tmp_path_factory.mktemp("runs"))
 
 
-@pytest.fixture(scope="module", params=["ours", "nearest-neighbour", "continuous"])
+@pytest.fixture(scope="module", params=["modulated", "nearest-neighbour", "continuous"])
 def run(
     request: pytest.FixtureRequest, encoder: Encoder, tmp_path_factory: pytest.TempPathFactory
 ) -> Run:

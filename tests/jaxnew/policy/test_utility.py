@@ -125,6 +125,29 @@ def test_the_factored_form_is_the_concatenated_form(kind: type[Utility], d: int)
 
 
 @pytest.mark.property
+@pytest.mark.parametrize("scale", [0.01, 1.0, 300.0])
+def test_a_modulated_utility_reads_representations_in_their_own_unit(scale: float) -> None:
+    """Moved and stretched as a whole, they are the same to it; their dimensions keep their ratios.
+
+    Roundings of 7 scale by 1e-7 are 1e-6 of the unit."""
+    rng = np.random.default_rng(8)
+    known = rng.normal(size=(50, D)) * np.linspace(0.2, 2.0, D)
+    known -= known.mean(axis=0)
+    unit = np.sqrt((known**2).mean())
+    plain = ModulatedMethod(NETWORK)
+    fresh = plain.init(jax.random.key(0), jnp.zeros(NUM_FEATURES), D)
+    drawn = numpy_policy.randomized(fresh, seed=1)
+    given = (scale * (known + 7.0)).astype(np.float32)
+    method = ModulatedMethod(NETWORK, given)
+    for name in ("project", "embed"):
+        found = getattr(method, name)(drawn, given[:9])
+        expected = getattr(plain, name)(drawn, (known[:9] / unit).astype(np.float32))
+        np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-3)
+    # One action has no deviation.
+    assert np.isfinite(ModulatedMethod(NETWORK, given[:1]).project(drawn, given[:1])).all()
+
+
+@pytest.mark.property
 def test_permuting_the_set_permutes_the_choices(
     method: UtilityMethod, params: Any, inputs: Any
 ) -> None:
