@@ -57,7 +57,7 @@ _STAGE_ONE = {
         num_recordings=64,
         model=_HVAE.in_minutes(num_steps=1800, actions_per_batch=16, recordings_per_action=4),
         checkpoint_every=100,
-        cost="half an hour on one core, and 1.1 GB on disk",
+        cost="20 minutes on one core, and 1.1 GB on disk",
         stores_drawn=True,
     ),
     "paper": StageOneBudget(
