@@ -112,7 +112,7 @@ def test_commands_for_other_processes_name_the_places() -> None:
     ],
 )
 def test_wrong_places(place: str, says: list[str]) -> None:
-    for load, legal in ((load_task, "grid_world, recommender"), (variant_of, "ours, no-subsamp")):
+    for load, legal in ((load_task, "grid_world, recommender"), (variant_of, "ours, modulated")):
         with pytest.raises(UsageError) as error:
             load(place)
         for words in [*says, repr(place), legal, "give package.module:"]:
