@@ -27,7 +27,6 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
-_METHOD = "modulated"
 _LENGTH = 0.75  # Its steps, in those of the budget: what ten minutes on two cores allow.
 
 
@@ -40,7 +39,7 @@ def main() -> int | None:
     run = train(
         task,
         encoder.table,
-        method=_METHOD,
+        method="modulated",
         budget=budget,
         set={
             "num_updates": num_updates,

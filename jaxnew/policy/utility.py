@@ -95,8 +95,7 @@ class ModulatedUtility(Utility):
         u = sum over the hidden layer of Lin(w, h)(f) * ReLU( Lin(2 w, h)( [f, a] ) )
 
     In each state it is a network of its own from embeddings to utilities, at the cost of one more
-    layer of `f`. Hidden layers have the usual gain of sqrt(2); the paper's gain of 0.01 in all of
-    them lets the utility learn slowly.
+    layer of `f`. Hidden layers have the usual gain of sqrt(2).
     """
 
     gain = _HIDDEN_GAIN
@@ -203,11 +202,14 @@ class ModulatedMethod(UtilityMethod):
 
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., h]: all that the policy needs of an action, in any state."""
-        return super().project(params, (representations - self._mean) / self._unit)
+        return super().project(params, self._in_unit(representations))
 
     def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., w]: the `a` of the utility."""
-        return super().embed(params, (representations - self._mean) / self._unit)
+        return super().embed(params, self._in_unit(representations))
+
+    def _in_unit(self, representations: jax.Array) -> jax.Array:
+        return (representations - self._mean) / self._unit
 
 
 class RandomMethod(UtilityMethod):
