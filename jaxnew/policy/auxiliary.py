@@ -14,6 +14,7 @@ depends on the action alone is computed once for a whole table.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -116,6 +117,12 @@ class HybridDistribution:
             stop=None if self.stop is None else self.stop.mode(),
             position=None if position is None else position.mode(),
         )
+
+    @property
+    def failure_loss(self) -> Callable[[HybridSample, jax.Array], jax.Array]:
+        """That of the choice. Raises AttributeError where the choice has none."""
+        of_choice: Callable[[Any, jax.Array], jax.Array] = self.choice.failure_loss
+        return lambda sample, is_failure: of_choice(sample.choice, is_failure)
 
     def _position_at(self, choice: Any) -> Beta | None:
         """The position's distribution f32[..., k], given the choice."""

@@ -21,7 +21,11 @@ Params = Any
 
 
 class Distribution(Protocol):
-    """A distribution over samples; a sample is a pytree, stored as it is by PPO."""
+    """A distribution over samples; a sample is a pytree, stored as it is by PPO.
+
+    One that foretells failures has `failure_loss(sample, is_failure: bool[...]) -> f32[...]` as
+    well, which is minimised beside the objective.
+    """
 
     def sample(self, key: jax.Array) -> Any:
         """A draw for every state [...]; consumes `key`."""

@@ -95,10 +95,13 @@ class ImageEncoder(nn.Module):
         return nn.relu(orthogonal_dense(self.width, _SQRT_2, "dense")(x))
 
 
-def _vector_features(obs: jax.Array, width: int) -> jax.Array:
+Activation = Callable[[jax.Array], jax.Array]
+
+
+def _vector_features(obs: jax.Array, width: int, activation: Activation) -> jax.Array:
     """Makes its two layers in the module that calls it."""
-    x = nn.tanh(orthogonal_dense(width, _SQRT_2)(obs))
-    return nn.tanh(orthogonal_dense(width, _SQRT_2)(x))
+    x = activation(orthogonal_dense(width, _SQRT_2)(obs))
+    return activation(orthogonal_dense(width, _SQRT_2)(x))
 
 
 class VectorEncoder(nn.Module):
@@ -108,19 +111,25 @@ class VectorEncoder(nn.Module):
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
-        return _vector_features(obs, self.width)
+        return _vector_features(obs, self.width, nn.tanh)
 
 
 class StateEncoder(nn.Module):
-    """The state feature f(s): f32[..., n] or uint8[..., H, W, C] -> f32[..., w]."""
+    """The state feature f(s): f32[..., n] or uint8[..., H, W, C] -> f32[..., w].
+
+    Attributes:
+      width: w.
+      activation: of the layers for vectors; those for images have ReLU.
+    """
 
     width: int = NetworkConfig.state_width
+    activation: Activation = nn.tanh
 
     @nn.compact
     def __call__(self, obs: jax.Array) -> jax.Array:
         if is_image(obs):
             return ImageEncoder(self.width, name="image")(obs)
-        return _vector_features(obs, self.width)
+        return _vector_features(obs, self.width, self.activation)
 
 
 class StateCritic(nn.Module):

@@ -11,12 +11,13 @@ middle weight only ever meet `f` and the last 64 only `a`: `[f, a] @ W = f @ W[:
 The second term depends on the action alone: `project` computes it once for a whole table, and what
 is left per state and action is an addition, a ReLU and a dot product with 64 numbers.
 
-Of `ModulatedUtility` these 64 numbers depend on the state.
+Of `ModulatedUtility` these 64 numbers depend on the state, and there are 64 more that say how
+likely the action is a failure.
 """
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, cast
 
 import flax.linen as nn
 import jax
@@ -25,8 +26,8 @@ import numpy as np
 
 from jaxnew.environment import Action
 from jaxnew.policy.config import NetworkConfig
-from jaxnew.policy.distributions import Categorical
-from jaxnew.policy.state_encoder import FeatureMethod, StateEncoder, apply
+from jaxnew.policy.distributions import Categorical, CautiousCategorical
+from jaxnew.policy.state_encoder import Activation, FeatureMethod, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
 _UTILITY_GAIN = 0.01  # The initial policy is almost exactly uniform.
@@ -65,18 +66,22 @@ class Utility(nn.Module):
         """f32[..., d] -> f32[..., h], the action's share of the hidden layer, bias included."""
         return self.embedded(representations) @ self.kernel[self.network.state_width :] + self.bias
 
-    def __call__(self, features: jax.Array, projected: jax.Array) -> jax.Array:
-        """Utilities f32[..., m] from features f32[..., w] and projected actions [..., m, h]."""
-        hidden = (features @ self.kernel[: self.network.state_width])[..., None, :] + projected
-        return self.scored(features, nn.relu(hidden))
+    def __call__(self, features: jax.Array, projected: jax.Array, mask: jax.Array) -> Categorical:
+        """The policy over projected actions [..., m, h] with features f32[..., w].
 
-    def scored(self, features: jax.Array, hidden: jax.Array) -> jax.Array:
-        """Utilities f32[..., m] from features f32[..., w] and the hidden layer f32[..., m, h]."""
+        Args:
+          mask: bool[..., m] true for a real entry.
+        """
+        hidden = (features @ self.kernel[: self.network.state_width])[..., None, :] + projected
+        return self.scored(features, nn.relu(hidden), mask)
+
+    def scored(self, features: jax.Array, hidden: jax.Array, mask: jax.Array) -> Categorical:
+        """The policy from features f32[..., w] and the hidden layer f32[..., m, h]."""
         del features
-        return self.score(hidden)[..., 0]
+        return Categorical.masked(self.score(hidden)[..., 0], mask)
 
     def concatenated(self, features: jax.Array, representations: jax.Array) -> jax.Array:
-        """The same utilities f32[..., m] as the paper writes them, from vectors f32[..., m, d].
+        """The utilities f32[..., m] as the paper writes them, from vectors f32[..., m, d].
 
         Kept as the reference for tests and benchmarks.
         """
@@ -85,20 +90,31 @@ class Utility(nn.Module):
             features[..., None, :], (*embedded.shape[:-1], features.shape[-1])
         )
         hidden = jnp.concatenate([repeated, embedded], axis=-1) @ self.kernel + self.bias
-        return self.scored(features, nn.relu(hidden))
+        mask = jnp.ones(embedded.shape[:-1], bool)
+        return self.scored(features, nn.relu(hidden), mask).logits
 
 
 class ModulatedUtility(Utility):
     """Utilities whose last weights depend on the state (docs/method.md, "Modulated utility").
 
         a = ReLU( Lin(d, w)(c) )
-        u = sum over the hidden layer of Lin(w, h)(f) * ReLU( Lin(2 w, h)( [f, a] ) )
+        x = ReLU( Lin(2 w, h)( [f, a] ) )
+        o = sum of Lin(w, h)(f) * x + Lin(w, 1)(f)
+        u = sum of Lin(w, h)(f) * x - k softplus(o)
 
-    In each state it is a network of its own from embeddings to utilities, at the cost of one more
-    layer of `f`. Hidden layers have the usual gain of sqrt(2).
+    In each state it is a network of its own from embeddings to utilities. `o` are the log-odds of a
+    failure, learned from what came of the actions that were taken, so that `-softplus(o)` is the
+    log-probability that there is none; `k` is one number, and the gradient of `u` does not reach
+    `o`. Hidden layers have the usual gain of sqrt(2).
     """
 
     gain = _HIDDEN_GAIN
+
+    def setup(self) -> None:
+        super().setup()
+        init = nn.initializers.orthogonal(_UTILITY_GAIN)
+        self.failure = nn.Dense(self.network.utility_width + 1, kernel_init=init)
+        self.caution = self.param("caution", nn.initializers.ones, (), jnp.float32)
 
     @property
     def num_scores(self) -> int:
@@ -109,9 +125,13 @@ class ModulatedUtility(Utility):
         """f32[..., d] -> f32[..., w], the action alone."""
         return nn.relu(self.embed(representations))
 
-    def scored(self, features: jax.Array, hidden: jax.Array) -> jax.Array:
-        """Utilities f32[..., m] from features f32[..., w] and the hidden layer f32[..., m, h]."""
-        return jnp.sum(hidden * self.score(features)[..., None, :], axis=-1)
+    def scored(self, features: jax.Array, hidden: jax.Array, mask: jax.Array) -> Categorical:
+        """The policy from features f32[..., w] and the hidden layer f32[..., m, h]."""
+        of_failure = self.failure(features)
+        odds = jnp.sum(hidden * of_failure[..., None, :-1], axis=-1) + of_failure[..., -1:]
+        utilities = jnp.sum(hidden * self.score(features)[..., None, :], axis=-1)
+        utilities -= self.caution * nn.softplus(jax.lax.stop_gradient(odds))
+        return CautiousCategorical(Categorical.masked(utilities, mask).logits, odds)
 
 
 class UtilityMethod(FeatureMethod):
@@ -123,10 +143,11 @@ class UtilityMethod(FeatureMethod):
 
     name = "ours"
     utility_type: type[Utility] = Utility
+    activation: Activation = staticmethod(nn.tanh)
 
     def __init__(self, network: NetworkConfig | None = None) -> None:
         super().__init__(network)
-        self._encoder = StateEncoder(self.network.state_width)
+        self._encoder = StateEncoder(self.network.state_width, self.activation)
         self._utility = self.utility_type(self.network)
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
@@ -162,8 +183,8 @@ class UtilityMethod(FeatureMethod):
           projected: f32[..., m, h] `project` of the available representations.
           mask: bool[..., m] true for a real entry of the set.
         """
-        utilities = apply(self._utility, params["utility"], features, projected)
-        return Categorical.masked(utilities, mask)
+        variables = {"params": params["utility"]}
+        return cast(Categorical, self._utility.apply(variables, features, projected, mask))
 
     def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
         """f32[..., d] -> f32[..., w]: the `a` of the utility."""
@@ -176,7 +197,8 @@ class UtilityMethod(FeatureMethod):
 
 
 class ModulatedMethod(UtilityMethod):
-    """A utility policy with a `ModulatedUtility`, which reads representations in their own unit.
+    """A utility policy with a `ModulatedUtility` and ReLUs in its state encoder, which reads
+    representations in their own unit.
 
     That is less their mean, over their deviation: one number, so that the shape of their space
     stays.
@@ -188,6 +210,7 @@ class ModulatedMethod(UtilityMethod):
 
     name = "modulated"
     utility_type = ModulatedUtility
+    activation = staticmethod(nn.relu)
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Generalised advantage estimation."""
+"""Generalised advantage estimation, and what counts as a failure."""
 
 from __future__ import annotations
 
@@ -33,8 +33,7 @@ def gae(
       advantages f32[T, N] and value targets f32[T, N] (advantages + values).
     """
     chex.assert_equal_shape([rewards, values, next_values, terminated, done])
-    goes_on = jnp.asarray(~terminated, jnp.float32)
-    deltas = rewards + discount * next_values * goes_on - values
+    deltas = temporal_differences(rewards, values, next_values, terminated, discount)
 
     def step(
         advantage: jax.Array, inputs: tuple[jax.Array, jax.Array]
@@ -45,3 +44,20 @@ def gae(
 
     _, advantages = jax.lax.scan(step, jnp.zeros_like(deltas[0]), (deltas, done), reverse=True)
     return advantages, advantages + values
+
+
+def temporal_differences(
+    rewards: jax.Array,
+    values: jax.Array,
+    next_values: jax.Array,
+    terminated: jax.Array,
+    discount: jax.Array | float,
+) -> jax.Array:
+    """f32[T, N] by how much each step was better than its observation's value; see `gae`."""
+    goes_on = jnp.asarray(~terminated, jnp.float32)
+    return rewards + discount * next_values * goes_on - values
+
+
+def failures(terminated: jax.Array, deltas: jax.Array) -> jax.Array:
+    """bool[T, N] steps that ended their episode for less than their observation's value."""
+    return terminated & (deltas < 0)

@@ -14,7 +14,7 @@ from jaxnew import finiteness
 from jaxnew.finiteness import counts_along
 from jaxnew.optimizer import in_32_bits
 from jaxnew.policy import PolicyMethod
-from jaxnew.ppo.advantages import gae
+from jaxnew.ppo.advantages import failures, gae, temporal_differences
 from jaxnew.ppo.config import PPOConfig
 from jaxnew.ppo.objective import Hyperparameters, Minibatch, loss, normalize_advantages
 from jaxnew.rollout.contract import Policy, Rollout, RolloutBatch
@@ -87,15 +87,9 @@ class GradientSteps:
     ) -> tuple[Any, Any, Metrics]:
         """Gradient steps on one rollout; consumes `key`. Returns (params, opt_state, metrics)."""
         terminated = batch.done if self.config.time_limits_are_ends else batch.terminated
-        advantages, value_targets = gae(
-            batch.reward,
-            batch.value,
-            batch.next_value,
-            terminated,
-            batch.done,
-            hyperparameters.discount,
-            hyperparameters.gae_lambda,
-        )
+        discount = hyperparameters.discount
+        seen = (batch.reward, batch.value, batch.next_value, terminated)
+        advantages, value_targets = gae(*seen, batch.done, discount, hyperparameters.gae_lambda)
         transitions = Minibatch(
             observation=jnp.zeros_like(batch.done),  # Looked up per minibatch.
             available=None if actions.is_fixed else batch.available,
@@ -104,6 +98,7 @@ class GradientSteps:
             value=batch.value,
             advantage=normalize_advantages(advantages),
             value_target=value_targets,
+            is_failure=failures(terminated, temporal_differences(*seen, discount)),
         )
         transitions = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), transitions)
         learning_rate = hyperparameters.learning_rate * self._learning_rate_factor(step)

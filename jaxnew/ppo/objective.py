@@ -66,6 +66,7 @@ class Minibatch:
       value: f32[B] value then.
       advantage: f32[B] normalised over the whole rollout.
       value_target: f32[B].
+      is_failure: bool[B] whether the episode ended badly, see `jaxnew.ppo.advantages.failures`.
     """
 
     observation: jax.Array
@@ -75,6 +76,7 @@ class Minibatch:
     value: jax.Array
     advantage: jax.Array
     value_target: jax.Array
+    is_failure: jax.Array
 
 
 def normalize_advantages(advantages: jax.Array) -> jax.Array:
@@ -94,7 +96,8 @@ def loss(
     hyperparameters: Hyperparameters,
     actions: Actions,
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
-    """Clipped surrogate, clipped value loss and entropy bonus, means over the minibatch.
+    """Clipped surrogate, clipped value loss and entropy bonus, means over the minibatch, and the
+    loss of a policy that foretells failures.
 
     Args:
       params: of the policy.
@@ -134,7 +137,13 @@ def loss(
         + hyperparameters.value_coefficient * value_loss
         - hyperparameters.entropy_coefficient * entropy
     )
+    foretold = {}
+    if hasattr(distribution, "failure_loss"):
+        failure_loss = jnp.mean(distribution.failure_loss(minibatch.sample, minibatch.is_failure))
+        total += failure_loss
+        foretold = {"loss/failure": failure_loss}
     return total, {
+        **foretold,
         "loss/total": total,
         "loss/policy": policy_loss,
         "loss/value": value_loss,

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 from flax import linen as nn
 
 from jaxnew.representation.config import RepresentationConfig
@@ -79,6 +80,18 @@ class Autoencoder(nn.Module):
             return Read(self.encoder(features, scales), features[:, :, 0], scales)
         hidden, start = self.encoder(features, training)
         return Read(hidden, start, scales)
+
+    def appended(self, features: jax.Array) -> jax.Array:
+        """f32[B, k] of recordings f32[B, S, T, D]: what follows the mean of the posterior.
+
+        With `appends_changes` k = (T - 1) D: the mean over recordings of the change from the first
+        step, in units of the change from step to step. Else k = 0.
+        """
+        is_vector = self.modality.image_shape is None and not self.modality.num_categories
+        if not (self.config.appends_changes and is_vector):
+            return jnp.zeros((len(features), 0), jnp.float32)
+        changes = jnp.mean(features[:, :, 1:] - features[:, :, :1], axis=1)
+        return (changes / self.scales(features, False).change).reshape(len(features), -1)
 
     def write(self, g: jax.Array, read: Read, features: jax.Array, training: bool) -> Any:
         """Means (or logits) of the scored steps, f32[B, S, T-1, D], of a still f32[B, S, 1, D].

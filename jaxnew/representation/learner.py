@@ -165,8 +165,11 @@ class RepresentationLearner:
         recordings: jax.Array | np.ndarray | RecordingSource,
         batch: int | None = None,
     ) -> np.ndarray:
-        """Action representations: the posterior means of `encode_posterior`, f32[A, d]."""
-        return self.encode_posterior(weights, recordings, batch)[0]
+        """Action representations f32[A, d], from the arguments of `encode_posterior`: its means,
+        and what the config appends to them.
+        """
+        means, _, appended = self._encoded(weights, recordings, batch)
+        return np.concatenate([means, appended], axis=1)
 
     def encode_posterior(
         self,
@@ -191,6 +194,15 @@ class RepresentationLearner:
           ValueError: `recordings` is not 4-dimensional or is empty, they do not suit the modality,
             or `batch` < 1.
         """
+        return self._encoded(weights, recordings, batch)[:2]
+
+    def _encoded(
+        self,
+        weights: EncoderWeights | RepresentationState,
+        recordings: jax.Array | np.ndarray | RecordingSource,
+        batch: int | None,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Means and log-variances of `encode_posterior`, and what is appended to the means."""
         if len(recordings.shape) != 2 + self.modality.recording_rank or 0 in recordings.shape:
             raise ValueError(
                 f"recordings must be a non-empty {self._recordings_form}, got shape "
@@ -208,8 +220,10 @@ class RepresentationLearner:
             parts.append(self._posterior(weights.params, weights.batch_stats, chunk))
             # At most one chunk waits while another is encoded, so that memory is bounded.
             parts[-2:-1] = jax.device_get(parts[-2:-1])
-        means, log_variances = zip(*jax.device_get(parts), strict=True)
-        return np.concatenate(means)[:num_actions], np.concatenate(log_variances)[:num_actions]
+        means, log_variances, appended = (
+            np.concatenate(part)[:num_actions] for part in zip(*jax.device_get(parts), strict=True)
+        )
+        return means, log_variances, appended
 
     def _check_trainable(self, shape: tuple[int, ...]) -> None:
         is_still = self.modality.is_still
@@ -364,12 +378,12 @@ class RepresentationLearner:
 
     def _posterior_of(
         self, params: Any, batch_stats: Any, recordings: jax.Array
-    ) -> tuple[jax.Array, jax.Array]:
+    ) -> tuple[jax.Array, jax.Array, jax.Array]:
         variables = {"params": params, "batch_stats": batch_stats}
-        posterior: Any = self._model.apply(
-            variables, self._features(recordings), method="posterior"
-        )
-        return posterior
+        features = self._features(recordings)
+        posterior: Any = self._model.apply(variables, features, method="posterior")
+        appended: Any = self._model.apply(variables, features, method="appended")
+        return *posterior, appended
 
 
 def _added(totals: Metrics, metrics: Metrics) -> Metrics:

@@ -51,7 +51,7 @@ VARIANTS = {
     "modulated": Variant(
         "modulated",
         minibatch_factor=4,
-        changes={"network__state_width": 128, "hyperparameters__representation_noise": 0.2},
+        changes={"network__state_width": 256, "hyperparameters__representation_noise": 0.2},
     ),
     "no-subsampling": Variant("ours", has_fixed_set=True, scores_fixed_set=True),
     "no-entropy": Variant("ours", changes={"hyperparameters__entropy_coefficient": 0.0}),

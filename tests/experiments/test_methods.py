@@ -130,7 +130,7 @@ def test_what_a_modulated_utility_is_trained_with(name: str) -> None:
     domain = Domain.of(load_task(name), None)
     for budget_name, budget in domain.task.stage_two.items():
         found = adapted(budget, "modulated", domain.task, domain.split)
-        assert (found.network.state_width, found.network.utility_width) == (128, 64)
+        assert (found.network.state_width, found.network.utility_width) == (256, 64)
         assert found.hyperparameters.representation_noise == 0.2
         assert found.num_updates == budget.num_updates
         assert found.ppo.steps_per_update == budget.ppo.steps_per_update

@@ -5,6 +5,7 @@ Written from `docs/method.md`, "Policy networks".
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -15,10 +16,16 @@ def dense(layer: dict[str, Any], x: np.ndarray) -> np.ndarray:
     return x @ np.asarray(layer["kernel"], np.float64) + np.asarray(layer["bias"], np.float64)
 
 
-def encode(layers: dict[str, Any], obs: np.ndarray) -> np.ndarray:
-    """`dense, tanh, dense, tanh`."""
-    hidden = np.tanh(dense(layers["Dense_0"], np.asarray(obs, np.float64)))
-    return np.tanh(dense(layers["Dense_1"], hidden))
+def relu(x: np.ndarray) -> np.ndarray:
+    return np.maximum(x, 0.0)
+
+
+def encode(
+    layers: dict[str, Any], obs: np.ndarray, activation: Callable[..., np.ndarray] = np.tanh
+) -> np.ndarray:
+    """Two dense layers, each with its activation."""
+    hidden = activation(dense(layers["Dense_0"], np.asarray(obs, np.float64)))
+    return activation(dense(layers["Dense_1"], hidden))
 
 
 def value(params: dict[str, Any], obs: np.ndarray) -> np.ndarray:
@@ -37,22 +44,34 @@ def utilities(params: dict[str, Any], obs: np.ndarray, representations: np.ndarr
     embedded = dense(utility["embed"], np.asarray(representations, np.float64))
     features = np.broadcast_to(features[..., None, :], (*embedded.shape[:-1], features.shape[-1]))
     hidden = dense(utility, np.concatenate([features, embedded], axis=-1))
-    return dense(utility["score"], np.maximum(hidden, 0.0))[..., 0]
+    return dense(utility["score"], relu(hidden))[..., 0]
+
+
+def modulated(
+    params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """f64[..., m] utilities and log-odds of a failure, with h numbers in the hidden layer x:
+
+    a_i = ReLU( Lin(d,w)(c_i) );  x_i = ReLU( Lin(2w,h)( [f(s), a_i] ) );
+    o_i = Lin(w,h)(f(s)) . x_i + Lin(w,1)(f(s));  u_i = Lin(w,h)(f(s)) . x_i - k ln(1 + e^o_i).
+    """
+    utility = params["utility"]
+    features = encode(params["encoder"], obs, relu)
+    embedded = relu(dense(utility["embed"], np.asarray(representations, np.float64)))
+    repeated = np.repeat(features[..., None, :], embedded.shape[-2], axis=-2)
+    hidden = relu(dense(utility, np.concatenate([repeated, embedded], axis=-1)))
+    failure = dense(utility["failure"], features)
+    odds = np.einsum("...h,...mh->...m", failure[..., :-1], hidden) + failure[..., -1:]
+    scores = np.einsum("...h,...mh->...m", dense(utility["score"], features), hidden)
+    caution = float(utility["caution"])
+    return scores - caution * np.logaddexp(0.0, odds), odds
 
 
 def modulated_utilities(
     params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
 ) -> np.ndarray:
-    """f64[..., m] as `utilities`, with h numbers in the hidden layer and w in f(s) and a:
-
-    a_i = ReLU( Lin(d,w)(c_i) );  u_i = Lin(w,h)(f(s)) . ReLU( Lin(2w,h)( [f(s), a_i] ) ).
-    """
-    utility = params["utility"]
-    features = encode(params["encoder"], obs)
-    embedded = np.maximum(dense(utility["embed"], np.asarray(representations, np.float64)), 0.0)
-    repeated = np.repeat(features[..., None, :], embedded.shape[-2], axis=-2)
-    hidden = np.maximum(dense(utility, np.concatenate([repeated, embedded], axis=-1)), 0.0)
-    return np.einsum("...h,...mh->...m", dense(utility["score"], features), hidden)
+    """The first of `modulated`."""
+    return modulated(params, obs, representations)[0]
 
 
 def log_softmax(utility: np.ndarray, mask: np.ndarray) -> np.ndarray:

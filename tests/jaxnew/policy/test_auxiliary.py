@@ -232,7 +232,10 @@ def test_the_gradient_reaches_every_parameter(name: str, is_conditioned: bool) -
 
     def total(params: Any) -> jax.Array:
         found = distribution_of(method, params)
-        return jnp.sum(found.log_prob(sample)) + jnp.sum(method.value(params, OBS))
+        total = jnp.sum(found.log_prob(sample)) + jnp.sum(method.value(params, OBS))
+        if name == "modulated":
+            total += jnp.sum(found.failure_loss(sample, jnp.ones(N, bool)))
+        return total
 
     gradients = jax.grad(total)(params)
     silent = [

@@ -114,7 +114,8 @@ def test_the_factored_form_is_the_concatenated_form(kind: type[Utility], d: int)
     paper = utility.apply(variables, features, representations, method="concatenated")
     projected = utility.apply(variables, representations, method="project")
     assert projected.shape == (BATCH, M, NETWORK.utility_width)
-    np.testing.assert_allclose(utility.apply(variables, features, projected), paper, **TOLERANCE)
+    found = utility.apply(variables, features, projected, np.ones((BATCH, M), bool))
+    np.testing.assert_allclose(found.logits, paper, **TOLERANCE)
     # The projection of a whole table and gathering of rows commute.
     rows = np.array([3, 0, 3])
     np.testing.assert_allclose(
@@ -285,6 +286,8 @@ def test_actor_and_critic_share_nothing(method: UtilityMethod, params: Any, inpu
     assert is_zero(value_grad["encoder"])
     assert is_zero(value_grad["utility"])
     assert is_zero(policy_grad["critic"])
+    # The odds of a failure are learned from what came of actions, not from what is gained by them.
+    assert is_zero(policy_grad["utility"].pop("failure", {}))
     for tree in (value_grad["critic"], policy_grad["encoder"], policy_grad["utility"]):
         assert all((np.asarray(x) != 0).any() for x in jax.tree.leaves(tree) if x.ndim == 2)
 

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
-from jaxnew.ppo import gae
+from jaxnew.ppo.advantages import failures, gae, temporal_differences
 
 T, N = 9, 3
 compiled = jax.jit(gae)
@@ -93,6 +93,24 @@ def test_worked_numbers() -> None:
     assert targets[:, 0].tolist() == [4.0, 7.0, 5.0]
     advantages, _ = gae(rewards, values, next_values, done, done, 0.5, 0.5)
     assert advantages[:, 0].tolist() == [0.25, 3.0, 3.0]
+
+
+@pytest.mark.unit
+def test_a_failure_ends_an_episode_for_less_than_expected() -> None:
+    """Differences of two environments: -0.5, 6, 3 and -9, 0, -4. Only the last two steps of the
+    first one and the first and the last of the second end an episode."""
+    rewards, values, next_values = (
+        jnp.array(x).T
+        for x in (
+            [[2.0, 4.0, 1.0], [0.0, 1.0, 0.0]],
+            [[3.0, 1.0, -2.0], [9.0, 3.0, 4.0]],
+            [[1.0, 6.0, 8.0], [5.0, 4.0, 0.0]],
+        )
+    )
+    terminated = jnp.array([[False, True, True], [True, False, True]]).T
+    deltas = temporal_differences(rewards, values, next_values, terminated, 0.5)
+    assert deltas.T.tolist() == [[-0.5, 3.0, 3.0], [-9.0, 0.0, -4.0]]
+    assert failures(terminated, deltas).T.tolist() == [[False] * 3, [True, False, True]]
 
 
 @pytest.mark.unit

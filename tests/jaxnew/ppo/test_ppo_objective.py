@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from typing import Any
 
 import jax
@@ -13,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from jaxnew.policy import UtilityMethod
+from jaxnew.policy.utility import ModulatedMethod
 from jaxnew.ppo import Hyperparameters
 from jaxnew.ppo.objective import Minibatch, loss, normalize_advantages
 from jaxnew.sampling import Actions, AvailableSet
@@ -20,7 +22,7 @@ from tests.jaxnew.policy import numpy_policy
 from tests.jaxnew.ppo import naive
 
 B, A, M, D, NUM_FEATURES = 40, 9, 5, 3, 4
-METHOD = UtilityMethod()
+METHOD, MODULATED = UtilityMethod(), ModulatedMethod()
 
 # float32 against float64 on means of 40 order-one numbers.
 TOLERANCE = {"rtol": 2e-5, "atol": 2e-5}
@@ -57,19 +59,22 @@ def transitions(params: Any, seed: int, log_ratio: np.ndarray, change: np.ndarra
         "value": (new_value - change).astype(np.float32),
         "advantage": rng.normal(size=B).astype(np.float32),
         "value_target": (new_value + rng.normal(0, 0.3, B)).astype(np.float32),
+        "is_failure": rng.random(B) < 0.3,
     }
 
 
-@jax.jit
-def compiled(params: Any, data: dict[str, jax.Array], hp: Hyperparameters) -> Any:
+@functools.partial(jax.jit, static_argnames="method")
+def compiled(
+    params: Any, data: dict[str, jax.Array], hp: Hyperparameters, method: UtilityMethod = METHOD
+) -> Any:
     """((total, parts), gradient) of the loss under test."""
     data = dict(data)
     available = AvailableSet(data.pop("ids"), data.pop("mask"))
     minibatch = Minibatch(available=available, **data)
 
     def total(params: Any) -> Any:
-        projected = METHOD.project(params, ACTIONS.offered(available))
-        return loss(params, projected, minibatch, available, METHOD, hp, ACTIONS)
+        projected = method.project(params, ACTIONS.offered(available))
+        return loss(params, projected, minibatch, available, method, hp, ACTIONS)
 
     return jax.value_and_grad(total, has_aux=True)(params)
 
@@ -102,6 +107,26 @@ def test_loss_parts_and_gradient(params: Any, spread: float, clip: float) -> Non
     assert_gradients_close(grads, expected_grads)
     if spread == 0.5:
         assert 0.2 < parts["policy/clipped"] < 1.0
+
+
+@pytest.mark.oracle
+def test_foretold_failures_are_learned_from_the_actions_that_were_taken(params: Any) -> None:
+    """Cross entropy of what came of them, in nats, with weight 1 beside the objective."""
+    shapes = MODULATED.init(jax.random.key(0), jnp.zeros(NUM_FEATURES), D)
+    foretelling = numpy_policy.randomized(shapes, seed=7)
+    data = transitions(params, 8, np.zeros(B), np.zeros(B))
+    (total, parts), grads = compiled(foretelling, data, Hyperparameters(), MODULATED)
+    _, odds = numpy_policy.modulated(foretelling, data["observation"], TABLE[data["ids"]])
+    odds = odds[np.arange(B), data["sample"]]
+    assert odds.std() > 0.2
+    expected = np.mean(np.logaddexp(0.0, np.where(data["is_failure"], -odds, odds)))
+    np.testing.assert_allclose(parts["loss/failure"], expected, **TOLERANCE)
+    hp = Hyperparameters()
+    rest = parts["loss/policy"] + hp.value_coefficient * parts["loss/value"]
+    rest -= hp.entropy_coefficient * parts["policy/entropy"]
+    np.testing.assert_allclose(total, rest + expected, **TOLERANCE)
+    slope = np.mean(1.0 / (1.0 + np.exp(-odds)) - data["is_failure"])  # Of the odds' bias.
+    np.testing.assert_allclose(grads["utility"]["failure"]["bias"][-1], slope, **TOLERANCE)
 
 
 def one_transition(
