@@ -7,6 +7,7 @@ everything else is as for ours.
 from __future__ import annotations
 
 import inspect
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -30,21 +31,22 @@ class Variant:
 
     Attributes:
       policy: its name in `jaxnew.policy.METHODS`, or the `package.module:NAME` of a user's own.
-      has_fixed_set: trained with one set of actions that never changes.
-      scores_fixed_set: it scores every action of that set, so that microbatches must be smaller.
+      scores_fixed_set: it scores every action of one set that never changes, so that microbatches
+        must be smaller.
       is_continuous: its output is a point, not a choice.
-      minibatch_factor: times as many minibatches per pass as the budget has, where it can be
-        divided so.
+      minibatch_factor: times as many minibatches per pass as the budget has; its greatest divisor
+        by which they can be divided.
       changes: fields of the budget that differ, as `StageTwoBudget.vary` takes them.
     """
 
     policy: str
-    has_fixed_set: bool = False
     scores_fixed_set: bool = False
     is_continuous: bool = False
     minibatch_factor: int = 1
     changes: Mapping[str, Any] = field(default_factory=dict)
 
+
+_ONE_SET = {"sets__is_fixed": True}  # Of all train actions, which never changes.
 
 VARIANTS = {
     "ours": Variant("ours"),
@@ -53,10 +55,10 @@ VARIANTS = {
         minibatch_factor=4,
         changes={"network__state_width": 256, "hyperparameters__representation_noise": 0.2},
     ),
-    "no-subsampling": Variant("ours", has_fixed_set=True, scores_fixed_set=True),
+    "no-subsampling": Variant("ours", scores_fixed_set=True, changes=_ONE_SET),
     "no-entropy": Variant("ours", changes={"hyperparameters__entropy_coefficient": 0.0}),
     "continuous": Variant("continuous", is_continuous=True),
-    "nearest-neighbour": Variant("discrete", has_fixed_set=True),
+    "nearest-neighbour": Variant("discrete", changes=_ONE_SET),
     "random": Variant("random"),
 }
 
@@ -133,11 +135,10 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
         ppo = replace(ppo, microbatch_size=min(size, ppo.microbatch_size))
     if variant.scores_fixed_set and task.baselines.fixed_set_minibatches:
         ppo = replace(ppo, num_minibatches=task.baselines.fixed_set_minibatches)
-    size, rest = divmod(ppo.minibatch_size, variant.minibatch_factor)
-    if not rest and not (ppo.microbatch_size and size % ppo.microbatch_size):
-        ppo = replace(ppo, num_minibatches=ppo.num_minibatches * variant.minibatch_factor)
-    sets = replace(budget.sets, is_fixed=variant.has_fixed_set)
-    return replace(budget, ppo=ppo, sets=sets)
+    parts = ppo.minibatch_size // (ppo.microbatch_size or 1)
+    factor = math.gcd(parts, variant.minibatch_factor)
+    ppo = replace(ppo, num_minibatches=ppo.num_minibatches * factor)
+    return replace(budget, ppo=ppo)
 
 
 def method_of(
