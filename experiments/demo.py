@@ -27,13 +27,13 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
-_LENGTH = 0.75  # Its steps, in those of the budget: what ten minutes on two cores allow.
+_LENGTH = 0.5  # Its steps, in those of the budget: what ten minutes on two cores allow.
 
 
 def main() -> int | None:
     start = time.perf_counter()
     task, budget = load_task("grid_world"), ARGUMENTS.budget
-    encoder = embed(task, budget=budget, runs=ARGUMENTS.runs)
+    encoder = embed(task, "hvae-changes", budget=budget, runs=ARGUMENTS.runs)
     preset = task.budget(budget)
     num_updates = round(_LENGTH * preset.num_updates)
     run = train(

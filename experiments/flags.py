@@ -31,9 +31,9 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
     "representation": (
         "string",
         "hvae",
-        "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot) "
-        "and -oracle (trained on all actions), random-SIZE, a run directory of embed, an .npz "
-        "table, or pretrained:NAME.",
+        "Engineered vectors by name (gt12), hvae or vae with an optional -MODALITY (hvae-onehot), "
+        "-changes (mean changes appended) and -oracle (trained on all actions), random-SIZE, a run "
+        "directory of embed, an .npz table, or pretrained:NAME.",
     ),
     "representation_budget": (
         "string",

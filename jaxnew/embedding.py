@@ -18,6 +18,7 @@ from jaxnew.observations import ObservationsError, Recordings
 from jaxnew.recording import (
     ORACLE,
     REPRESENTATION_SEED,
+    Learned,
     PlayRecordings,
     collect,
     parse_representation,
@@ -26,7 +27,6 @@ from jaxnew.recording import (
 from jaxnew.representation import report
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.learner import EncoderWeights, RepresentationLearner
-from jaxnew.representation.modality import Modality
 from jaxnew.representation.table import RepresentationTable, engineered_table, random_table
 from jaxnew.storage.arrays import read_arrays, write_arrays
 from jaxnew.storage.checkpoint import Checkpointer, CheckpointError
@@ -145,8 +145,9 @@ class Encoder:
     def frozen(self) -> tuple[RepresentationLearner, EncoderWeights, Play]:
         """The learner, its weights at the end, and the play whose recordings it reads."""
         model = self.config.model
-        _, play, modality = parse_representation(self.domain(), self.config.representation)
-        learner = RepresentationLearner(model, modality)
+        learned = parse_representation(self.domain(), self.config.representation)
+        play = learned.play
+        learner = RepresentationLearner(model, learned.modality, learned.appends_changes)
         shape = (model.actions_per_batch, model.recordings_per_action, *play.seen.shape)
         example = jax.eval_shape(lambda: learner.init(jax.random.key(0), shape))
         if (self.path / WEIGHTS_FILE).exists():
@@ -230,7 +231,7 @@ def embed(
 
     Args:
       task: the domain, or what `load_task` takes.
-      representation: `hvae` or `vae` with an optional `-MODALITY` and `-oracle`, see
+      representation: `hvae` or `vae` with an optional `-MODALITY`, `-changes` and `-oracle`, see
         `parse_representation`.
       budget: a preset of stage one.
       seed: of the run, 0..2^32 - 1.
@@ -271,7 +272,7 @@ def embed(
         path, identity(config), overwrite, provenance, upgrade=upgraded
     ) as directory:
         source = f"{representation}, {budget}, seed {config.seed}"
-        stopped_by = _train(directory, domain, config, learned.modality, preset, recordings, source)
+        stopped_by = _train(directory, domain, config, learned, preset, recordings, source)
     return replace(Encoder.load(path, task), interrupted_by=stopped_by)
 
 
@@ -311,7 +312,7 @@ def _train(
     directory: RunDirectory,
     domain: Domain,
     config: EmbedConfig,
-    modality: Modality,
+    learned: Learned,
     preset: StageOneBudget,
     recordings: PlayRecordings,
     source: str,
@@ -322,7 +323,7 @@ def _train(
       The number of the signal that stopped it before there was a table, or None.
     """
     model, name = config.model, config.representation
-    learner = RepresentationLearner(model, modality)
+    learner = RepresentationLearner(model, learned.modality, learned.appends_changes)
     data = recordings.for_training(_with_always_available(domain.split, config.train_on))
     is_made = (directory.path / TABLE_FILE).exists()
     chunk_steps = min(preset.chunk_steps, preset.checkpoint_every)

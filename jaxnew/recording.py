@@ -28,37 +28,49 @@ from jaxnew.task.task import Drawing, Play, Task
 
 # One encoder is shared by all policy seeds, as in the paper; so are the recordings.
 REPRESENTATION_SEED = 31
-ORACLE = "-oracle"
+CHANGES, ORACLE = "-changes", "-oracle"
 
 
 class Learned(NamedTuple):
-    """What the name of a learned representation says: `hvae` or `vae`, of what, and how read."""
+    """What the name of a learned representation says: `hvae` or `vae`, of what, and how read; and
+    whether mean changes are appended.
+    """
 
     kind: str
     play: Play
     modality: Modality
+    appends_changes: bool
 
 
 def parse_representation(domain: Domain, name: str) -> Learned:
     """What a learned representation's name, such as `hvae` or `vae-onehot`, says.
 
-    The suffix `-oracle` says that the encoder is trained on all actions, test ones included.
+    The suffix `-changes` says that mean changes are appended, see `Autoencoder.mean_changes`, and
+    behind it `-oracle` that the encoder is trained on all actions, test ones included.
 
     Raises:
       UsageError: the name is not of that form.
     """
-    kind, _, modality_name = name.removesuffix(ORACLE).partition("-")
+    base = name.removesuffix(ORACLE)
+    kind, _, modality_name = base.removesuffix(CHANGES).partition("-")
     modality_name = modality_name or next(iter(domain.play.modalities))
     of_play = {name: play for play in domain.task.plays for name in play.modalities}
     if kind not in ("hvae", "vae") or modality_name not in of_play:
         legal = [f"{k}-{m}" for k in ("hvae", "vae") for m in of_play]
         raise UsageError(
             f"Unknown representation {name!r}. Learned: hvae, vae, {', '.join(legal)}, each also "
-            f"with {ORACLE}; engineered: {', '.join(domain.universe.engineered)}; random-SIZE; or "
-            "an embed run, or an .npz file."
+            f"with {CHANGES} and {ORACLE}; engineered: {', '.join(domain.universe.engineered)}; "
+            "random-SIZE; or an embed run, or an .npz file."
         )
     play = of_play[modality_name]
-    return Learned(kind, play, play.modalities[modality_name])
+    modality = play.modalities[modality_name]
+    appends_changes = base.endswith(CHANGES)
+    if appends_changes and not modality.is_gaussian_vector:
+        raise UsageError(
+            f"{name!r}: changes are appended where recordings are vectors with a Gaussian "
+            f"likelihood, and {modality_name!r} are not; leave out {CHANGES}."
+        )
+    return Learned(kind, play, modality, appends_changes)
 
 
 @dataclass(frozen=True)

@@ -112,10 +112,7 @@ TASK = Task(
         "smoke": StageOneBudget(
             num_recordings=16,
             model=_STAGE_ONE.model.in_minutes(
-                num_steps=8,
-                actions_per_batch=16,
-                recordings_per_action=4,
-                appends_changes=True,
+                num_steps=8, actions_per_batch=16, recordings_per_action=4
             ),
             checkpoint_every=20,
             cost="seconds",
@@ -123,10 +120,7 @@ TASK = Task(
         "laptop": StageOneBudget(
             num_recordings=256,
             model=_STAGE_ONE.model.in_minutes(
-                num_steps=1600,
-                actions_per_batch=64,
-                recordings_per_action=8,
-                appends_changes=True,
+                num_steps=1600, actions_per_batch=64, recordings_per_action=8
             ),
             checkpoint_every=80,
             cost="about two minutes on one core",

@@ -81,15 +81,10 @@ class Autoencoder(nn.Module):
         hidden, start = self.encoder(features, training)
         return Read(hidden, start, scales)
 
-    def appended(self, features: jax.Array) -> jax.Array:
-        """f32[B, k] of recordings f32[B, S, T, D]: what follows the mean of the posterior.
-
-        With `appends_changes` k = (T - 1) D: the mean over recordings of the change from the first
-        step, in units of the change from step to step. Else k = 0.
+    def mean_changes(self, features: jax.Array) -> jax.Array:
+        """f32[B, (T - 1) D] of recordings f32[B, S, T, D]: the mean over S of each later step's
+        change from the first, in units of the change from step to step.
         """
-        is_vector = self.modality.image_shape is None and not self.modality.num_categories
-        if not (self.config.appends_changes and is_vector):
-            return jnp.zeros((len(features), 0), jnp.float32)
         changes = jnp.mean(features[:, :, 1:] - features[:, :, :1], axis=1)
         return (changes / self.scales(features, False).change).reshape(len(features), -1)
 

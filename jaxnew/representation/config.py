@@ -37,9 +37,6 @@ class RepresentationConfig:
       predicts_changes: the decoder adds what it gives to the last step, of a video to the last
         frame's code, and starts from the first frame; False: it gives the step.
       reads_changes: the encoder reads how far each step, or pixel, is from the one before, too.
-      appends_changes: a representation goes on with the mean over the action's recordings of how
-        far each later step is from the first, in the units of `standardizes`. Of vectors with a
-        Gaussian likelihood; others have nothing appended.
 
     Raises:
       TypeError: a count is not an integer.
@@ -62,7 +59,6 @@ class RepresentationConfig:
     standardizes: bool = False
     predicts_changes: bool = False
     reads_changes: bool = False
-    appends_changes: bool = False
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:

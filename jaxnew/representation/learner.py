@@ -83,11 +83,19 @@ class RepresentationLearner:
     Recordings are given in their stored dtype, `[A, S_total, T, D0]`, and become features only
     after a batch has been drawn. They are an array, which training keeps on the device, or a
     `RecordingSource`, which gives each batch when it is needed.
+
+    Attributes:
+      config: hyper-parameters.
+      modality: what was recorded.
+      appends_changes: `Autoencoder.mean_changes` stand behind the means of the posterior.
     """
 
-    def __init__(self, config: RepresentationConfig, modality: Modality) -> None:
+    def __init__(
+        self, config: RepresentationConfig, modality: Modality, appends_changes: bool = False
+    ) -> None:
         self.config = config
         self.modality = modality
+        self.appends_changes = appends_changes
         self._model = build_model(config, modality)
         self._batches = Batches.of(config, modality)
         # Betas 0.9 and 0.999, eps 1e-8: `docs/method.md`, "Objective of stage 1".
@@ -166,7 +174,7 @@ class RepresentationLearner:
         batch: int | None = None,
     ) -> np.ndarray:
         """Action representations f32[A, d], from the arguments of `encode_posterior`: its means,
-        and what the config appends to them.
+        and what is appended to them.
         """
         means, _, appended = self._encoded(weights, recordings, batch)
         return np.concatenate([means, appended], axis=1)
@@ -382,7 +390,9 @@ class RepresentationLearner:
         variables = {"params": params, "batch_stats": batch_stats}
         features = self._features(recordings)
         posterior: Any = self._model.apply(variables, features, method="posterior")
-        appended: Any = self._model.apply(variables, features, method="appended")
+        appended: Any = jnp.zeros((len(features), 0), jnp.float32)
+        if self.appends_changes:
+            appended = self._model.apply(variables, features, method="mean_changes")
         return *posterior, appended
 
 

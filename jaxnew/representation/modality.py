@@ -90,6 +90,11 @@ class Modality:
         return 1 if self.is_still else recordings_shape[2]
 
     @property
+    def is_gaussian_vector(self) -> bool:
+        """Whether a step is a vector of numbers that have units."""
+        return self.image_shape is None and not self.num_categories
+
+    @property
     def gaussian_dim(self) -> int:
         """D if the likelihood is Gaussian, else 0."""
         return 0 if self.num_categories else self.feature_dim

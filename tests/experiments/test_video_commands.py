@@ -188,7 +188,7 @@ def test_stored_frames_are_gone_on_with_and_belong_to_their_poses(tmp_path: Path
 def test_every_create_task_has_videos(name: str) -> None:
     domain = Domain.of(load_task(name))
     for representation in ("hvae-video", "vae-video-oracle"):
-        kind, play, modality = parse_representation(domain, representation)
+        kind, play, modality, _ = parse_representation(domain, representation)
         assert kind == representation.partition("-")[0]
         assert (modality.name, modality.image_shape) == ("video", (48, 48, 1))
         assert play.seen.shape == (7, 48, 48, 1)

@@ -57,8 +57,11 @@ def encoder(runs: Path) -> Encoder:
 
 
 def test_names_say_kind_play_and_modality() -> None:
-    kind, play, modality = parse_representation(DOMAIN, "vae")
-    assert (kind, play, modality.name) == ("vae", toy_device.PLAY, "way")
+    kind, play, modality, appends_changes = parse_representation(DOMAIN, "vae")
+    assert (kind, play, modality.name, appends_changes) == ("vae", toy_device.PLAY, "way", False)
+    changes = parse_representation(DOMAIN, "hvae-way-changes-oracle")
+    assert (changes.kind, changes.modality.name, changes.appends_changes) == ("hvae", "way", True)
+    assert parse_representation(DOMAIN, "vae-changes").appends_changes
     assert parse_representation(DOMAIN, "hvae-way-oracle").kind == "hvae"
     domain = Domain.of(VIDEO)
     assert parse_representation(domain, "hvae").play is video_task.STATES
@@ -141,6 +144,22 @@ def test_the_table_covers_every_action(encoder: Encoder) -> None:
     assert np.ptp(table.vectors, axis=0).min() > 0
     with pytest.raises(SplitMismatch, match="split"):
         table.check(DOMAIN.universe, Domain.of(LADDER, split_seed=1).split)
+
+
+def test_mean_changes_follow_what_the_same_encoder_makes(encoder: Encoder, runs: Path) -> None:
+    """In its table, and of new recordings."""
+    other = embed(LADDER, "hvae-changes", budget="smoke", runs=runs)
+    size = encoder.table.vectors.shape[1]
+    np.testing.assert_array_equal(other.table.vectors[:, :size], encoder.table.vectors)
+    steps, numbers = toy_device.PLAY.format.shape
+    assert other.table.vectors.shape[1] == size + (steps - 1) * numbers
+    old = collect(DOMAIN, encoder.path.parents[1], 3).recorded.select(np.array([1, 4]))
+    np.testing.assert_allclose(other.encode(old).vectors, other.table.rows(old.ids), atol=1e-5)
+
+
+def test_images_have_no_changes_to_append() -> None:
+    with pytest.raises(UsageError, match=r"'hvae-video-changes': .* 'video' are not; leave out"):
+        parse_representation(Domain.of(VIDEO), "hvae-video-changes")
 
 
 def test_a_finished_run_is_found_complete(

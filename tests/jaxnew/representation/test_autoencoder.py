@@ -1,4 +1,4 @@
-"""What an encoder appends to the means of its posterior (docs/method.md, "Encoders in minutes")."""
+"""What an encoder appends to its means (docs/method.md, "Representation table and its report")."""
 
 from __future__ import annotations
 
@@ -10,12 +10,7 @@ import pytest
 
 from jaxnew.representation.config import RepresentationConfig
 from jaxnew.representation.learner import RepresentationLearner, RepresentationState
-from jaxnew.representation.modality import (
-    Modality,
-    image_modality,
-    one_hot_modality,
-    vector_modality,
-)
+from jaxnew.representation.modality import Modality, vector_modality
 
 A, S, T = 6, 5, 4
 CONFIG = RepresentationConfig(
@@ -28,7 +23,6 @@ CONFIG = RepresentationConfig(
     recordings_per_action=3,
     num_steps=3,
     standardizes=True,
-    appends_changes=True,
 )
 
 
@@ -36,7 +30,7 @@ def trained(
     config: RepresentationConfig, modality: Modality, recordings: np.ndarray
 ) -> tuple[RepresentationLearner, RepresentationState]:
     """(learner, state after all steps)."""
-    stage1 = RepresentationLearner(config, modality)
+    stage1 = RepresentationLearner(config, modality, appends_changes=True)
     state = stage1.init(jax.random.key(0), recordings.shape)
     state, _ = stage1.train_steps(state, jax.numpy.asarray(recordings), config.num_steps)
     return stage1, state
@@ -67,28 +61,3 @@ def test_mean_changes_follow_the_means_of_the_posterior(kind: str, latent: int) 
     np.testing.assert_allclose(
         stage1.encode(state, few)[:, latent:], expected, rtol=1e-4, atol=1e-4
     )
-
-
-@pytest.mark.unit
-@pytest.mark.parametrize(
-    ("modality", "shape"),
-    [(one_hot_modality("o", 2, 9), (T, 2)), (image_modality("i", (48, 48, 1), True), (48, 48, 1))],
-    ids=["categories", "images"],
-)
-def test_categories_and_images_have_nothing_appended(
-    modality: Modality, shape: tuple[int, ...]
-) -> None:
-    recordings = np.random.default_rng(2).integers(0, 9, (4, 3, *shape)).astype(np.uint8)
-    stage1 = RepresentationLearner(CONFIG, modality)
-    state = stage1.init(jax.random.key(0), recordings.shape)
-    assert stage1.encode(state, recordings).shape == (4, 3)
-
-
-@pytest.mark.unit
-def test_nothing_is_appended_by_default() -> None:
-    assert not RepresentationConfig().appends_changes
-    recordings = np.random.default_rng(3).normal(size=(A, S, T, 2)).astype(np.float32)
-    config = dataclasses.replace(CONFIG, appends_changes=False)
-    stage1, state = trained(config, vector_modality("v", 2), recordings)
-    means, _ = stage1.encode_posterior(state, recordings)
-    np.testing.assert_array_equal(stage1.encode(state, recordings), means)
