@@ -37,7 +37,7 @@ ARGUMENTS.define(
 ARGUMENTS.define("list", "sets", ["test"], "Parts of the split: train, validation, test, all.")
 ARGUMENTS.define("integer", "episodes", 5000, "Episodes per set.")
 ARGUMENTS.define("bool", "deterministic", False, "Take the most likely action.")
-ARGUMENTS.define("integer", "set_size", None, "Actions per set; default: as in training.")
+ARGUMENTS.define("integer", "set_size", None, "Actions per set; default: the run's sets.size.")
 ARGUMENTS.define(
     "integer",
     "grows_from",

@@ -164,7 +164,7 @@ class Run:
           unseen_ratio: draw from a mixture of train and test actions with such a share of the
             latter.
           episodes: per list of actions.
-          set_size: actions per set; None for as many as in training.
+          set_size: actions per set; None for the run's `sets.size`.
           grows_from, growth: of a set that grows during the episode, see `Actions.first_size`.
           greedy: take the most likely action instead of sampling.
           seed: of the episodes.

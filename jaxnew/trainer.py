@@ -78,7 +78,7 @@ class Trainer:
             training = Actions.of(
                 vectors,
                 ids,
-                sets.size,
+                sets.training_size or sets.size,
                 padded_size=sets.padded_size,
                 always_available=always,
                 groups=balanced_clusters(table.rows(ids), config.num_clusters)
@@ -128,7 +128,7 @@ class Trainer:
         Args:
           name: part of the split, or of the ids.
           ids: int32[n] in place of the part's.
-          set_size: None for as many as in training: all of them on the part that a method with one
+          set_size: None for the run's `sets.size`: all of them on the part that a method with one
             fixed set was trained with.
           vectors: f32[A, d] in place of the run's own table.
 

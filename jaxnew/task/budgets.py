@@ -75,7 +75,7 @@ class LoopConfig:
       chunk_updates: updates per compiled call.
       evaluate_every: updates between evaluations on train and validation sets.
       evaluation_episodes: episodes per evaluation and split.
-      evaluation_set_size: actions in its sets; 0 for as many as in training.
+      evaluation_set_size: actions in its sets; 0 for `sets.size`.
       checkpoint_every: updates between `latest` checkpoints, which are five minutes apart at most.
     """
 

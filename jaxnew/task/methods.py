@@ -34,6 +34,8 @@ class Variant:
       scores_fixed_set: it scores every action of one set that never changes, so that microbatches
         must be smaller.
       is_continuous: its output is a point, not a choice.
+      training_share: of the actions of a set, those that are there in episodes that are learned
+        from.
       minibatch_factor: times as many minibatches per pass as the budget has; its greatest divisor
         by which they can be divided.
       changes: fields of the budget that differ, as `StageTwoBudget.vary` takes them.
@@ -42,6 +44,7 @@ class Variant:
     policy: str
     scores_fixed_set: bool = False
     is_continuous: bool = False
+    training_share: float = 1.0
     minibatch_factor: int = 1
     changes: Mapping[str, Any] = field(default_factory=dict)
 
@@ -52,6 +55,7 @@ VARIANTS = {
     "ours": Variant("ours"),
     "modulated": Variant(
         "modulated",
+        training_share=0.5,
         minibatch_factor=4,
         changes={"network__state_width": 256, "hyperparameters__representation_noise": 0.2},
     ),
@@ -138,7 +142,10 @@ def adapted(budget: StageTwoBudget, name: str, task: Task, split: ActionSplit) -
     parts = ppo.minibatch_size // (ppo.microbatch_size or 1)
     factor = math.gcd(parts, variant.minibatch_factor)
     ppo = replace(ppo, num_minibatches=ppo.num_minibatches * factor)
-    return replace(budget, ppo=ppo)
+    sets = budget.sets
+    if variant.training_share < 1.0:
+        sets = replace(sets, training_size=math.ceil(sets.size * variant.training_share))
+    return replace(budget, ppo=ppo, sets=sets)
 
 
 def method_of(

@@ -262,6 +262,7 @@ def upgraded(recorded: Mapping[str, Any]) -> dict[str, Any]:
         names = {"set_size": "size", "padded_set_size": "padded_size", "has_fixed_set": "is_fixed"}
         new["sets"] = {name: rollout.pop(old) for old, name in names.items()}
         new["ppo"] = {**new["ppo"], "rollout": rollout}
+    new["sets"] = {**config_lib.plain(SetConfig()), **new["sets"]}
     if isinstance(new["environment"], list):  # And settings of the environment were texts.
         settings = load_task(new["task"], is_recorded=True).environment
         if settings is not None:

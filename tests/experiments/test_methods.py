@@ -132,6 +132,8 @@ def test_what_a_modulated_utility_is_trained_with(name: str) -> None:
         found = adapted(budget, "modulated", domain.task, domain.split)
         assert (found.network.state_width, found.network.utility_width) == (256, 64)
         assert found.hyperparameters.representation_noise == 0.2
+        assert (found.sets.size, budget.sets.training_size) == (budget.sets.size, 0)
+        assert found.sets.training_size == (budget.sets.size + 1) // 2
         assert found.num_updates == budget.num_updates
         assert found.ppo.steps_per_update == budget.ppo.steps_per_update
         # Two environments of 11 steps cannot be divided by eight.

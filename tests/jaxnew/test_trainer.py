@@ -179,7 +179,8 @@ def test_settings_of_a_run_reach_its_environment() -> None:
 
 @pytest.mark.unit
 def test_sets_of_training_and_of_evaluations() -> None:
-    trainer = ladder_of({"sets.size": 3, "sets.padded_size": 5, "loop.evaluation_set_size": 2})
+    sets = {"sets.size": 3, "sets.padded_size": 5, "sets.training_size": 4}
+    trainer = ladder_of({**sets, "loop.evaluation_set_size": 2})
     split, table = trainer.split, np.asarray(trainer.table.vectors)
     np.testing.assert_array_equal(trainer.training.table, table)
     sizes = {
@@ -193,7 +194,7 @@ def test_sets_of_training_and_of_evaluations() -> None:
         }.items()
     }
     assert sizes == {
-        "training": (3, 5, 12, False),
+        "training": (4, 5, 12, False),
         "train": (2, 2, 12, False),
         "validation": (2, 2, 6, False),
         "of a part": (3, 5, 6, False),

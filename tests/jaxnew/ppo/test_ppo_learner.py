@@ -195,7 +195,7 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
     assert (config.rollout.num_envs, config.rollout.num_steps) == (32, 512)
     assert (config.num_epochs, config.num_minibatches, config.minibatch_size) == (4, 4, 4096)
     assert (config.lr_steps, config.max_grad_norm) == (40_000_000, 0.5)
-    assert SetConfig() == SetConfig(size=50, padded_size=0, is_fixed=False)
+    assert SetConfig() == SetConfig(size=50, padded_size=0, is_fixed=False, training_size=0)
     assert config.time_limits_are_ends
 
 
