@@ -24,6 +24,7 @@ class Hyperparameters:
       discount: gamma.
       gae_lambda: lambda of the advantage estimator.
       value_coefficient: weight of the value loss.
+      failure_coefficient: weight of the loss of a policy that foretells failures.
       representation_noise: deviation of the Gaussian noise on representations during training, in
         that of the actions that are trained with, see `Actions.perturbed`.
     """
@@ -34,6 +35,7 @@ class Hyperparameters:
     discount: float = 0.99
     gae_lambda: float = 0.95
     value_coefficient: float = 0.5
+    failure_coefficient: float = 1.0
     representation_noise: float = 0.0
 
     def check(self) -> None:
@@ -45,6 +47,7 @@ class Hyperparameters:
             "discount": (0.0, 1.0),
             "gae_lambda": (0.0, 1.0),
             "value_coefficient": (0.0, math.inf),
+            "failure_coefficient": (0.0, math.inf),
             "representation_noise": (0.0, math.inf),
         }
         for name, (low, high) in ranges.items():
@@ -140,7 +143,7 @@ def loss(
     foretold = {}
     if hasattr(distribution, "failure_loss"):
         failure_loss = jnp.mean(distribution.failure_loss(minibatch.sample, minibatch.is_failure))
-        total += failure_loss
+        total += hyperparameters.failure_coefficient * failure_loss
         foretold = {"loss/failure": failure_loss}
     return total, {
         **foretold,

@@ -190,6 +190,7 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
         "discount": 0.99,
         "gae_lambda": 0.95,
         "value_coefficient": 0.5,
+        "failure_coefficient": 1.0,
         "representation_noise": 0.0,
     }
     assert (config.rollout.num_envs, config.rollout.num_steps) == (32, 512)

@@ -94,6 +94,7 @@ CHOICES = {
     "hyperparameters.learning_rate": st.floats(0, 1),
     "hyperparameters.entropy_coefficient": st.floats(0, 1e9),
     "hyperparameters.discount": st.floats(0, 1),
+    "hyperparameters.failure_coefficient": numbers,
     "hyperparameters.representation_noise": numbers,
     "loop.evaluate_every": st.integers(1, 99),
     "loop.evaluation_set_size": st.integers(0, 99),
