@@ -66,7 +66,10 @@ METHODS: dict[str, type[UtilityMethod]] = {
 def factored(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:
     """Utilities of the layer alone, of the rows of a projected table."""
     projected = Utility().apply(params, table, method="project")
-    return Utility().apply(params, features, jnp.asarray(projected)[ids])
+    policy: Any = Utility().apply(
+        params, features, jnp.asarray(projected)[ids], jnp.ones(ids.shape, bool)
+    )
+    return policy.logits
 
 
 def concatenated(params: Any, features: jax.Array, table: jax.Array, ids: jax.Array) -> Any:

@@ -274,7 +274,10 @@ def test_what_methods_are_made_of(
     assert fixed == set(FIXED_SETS)
     assert config["clusters"]["num_clusters"] == 10
     assert all(name == "clusters" or not config[name]["num_clusters"] for name in RUNS)
-    assert size["no-entropy"] == size["full"] == size["clusters"] == size["line"]
+    assert size["no-entropy"] == size["full"] == size["line"]
+    modulated = size.pop("clusters")
+    assert modulated["utility.score.kernel"] == (256, 64)
+    assert modulated["auxiliary.heads.stop.kernel"] == (256, 2)
     assert size["no-place"]["policy.logits.kernel"] == (64, 405)
     assert size["continuous"]["policy.mean.kernel"] == (64, WIDTH)
     for name in ("no-place", "continuous"):
