@@ -127,7 +127,8 @@ class SetConfig:
       size: m, actions available in an episode.
       padded_size: width of the sets; entries past their size are masked. 0 means no padding.
       is_fixed: all actions of training are available in every episode; the sizes are not used.
-      training_size: actions available in episodes that are learned from; 0 means `size`.
+      training_size: actions available in episodes that are learned from, at most `size`, which
+        evaluations have; 0 means `size`.
     """
 
     size: int = 50
@@ -138,16 +139,15 @@ class SetConfig:
     def __post_init__(self) -> None:
         if self.size < 1:
             raise ValueError(f"size={self.size} must be at least 1.")
-        if self.training_size < 0:
+        if not 0 <= self.training_size <= self.size:
             raise ValueError(
-                f"training_size={self.training_size} must be at least 1, or 0 for size={self.size}."
+                f"training_size={self.training_size} must be in 1..{self.size}, the size of the "
+                "sets, or 0 for that size; set both."
             )
-        for name in ("size", "training_size"):
-            if self.padded_size and self.padded_size < getattr(self, name):
-                raise ValueError(
-                    f"padded_size={self.padded_size} is below {name}={getattr(self, name)}; use 0 "
-                    "for no padding."
-                )
+        if self.padded_size and self.padded_size < self.size:
+            raise ValueError(
+                f"padded_size={self.padded_size} is below size={self.size}; use 0 for no padding."
+            )
 
 
 @struct.dataclass

@@ -179,8 +179,8 @@ def test_settings_of_a_run_reach_its_environment() -> None:
 
 @pytest.mark.unit
 def test_sets_of_training_and_of_evaluations() -> None:
-    sets = {"sets.size": 3, "sets.padded_size": 5, "sets.training_size": 4}
-    trainer = ladder_of({**sets, "loop.evaluation_set_size": 2})
+    sets = {"sets.size": 3, "sets.padded_size": 5, "sets.training_size": 2}
+    trainer = ladder_of({**sets, "loop.evaluation_set_size": 4})
     split, table = trainer.split, np.asarray(trainer.table.vectors)
     np.testing.assert_array_equal(trainer.training.table, table)
     sizes = {
@@ -194,9 +194,9 @@ def test_sets_of_training_and_of_evaluations() -> None:
         }.items()
     }
     assert sizes == {
-        "training": (4, 5, 12, False),
-        "train": (2, 2, 12, False),
-        "validation": (2, 2, 6, False),
+        "training": (2, 5, 12, False),
+        "train": (4, 4, 12, False),
+        "validation": (4, 4, 6, False),
         "of a part": (3, 5, 6, False),
         "of a size": (4, 4, 6, False),
         "of ids": (3, 5, 3, False),
