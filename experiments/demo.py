@@ -81,8 +81,7 @@ def print_success(run: Run, num_episodes: int) -> None:
 
 def uniform(policy: Policy) -> Policy:
     """A policy that gives every action the same utility."""
-    utility = {**policy.params["utility"]}
-    utility["score"] = jax.tree.map(jnp.zeros_like, utility["score"])
+    utility = jax.tree.map(jnp.zeros_like, policy.params["utility"])
     return replace(policy, params={**policy.params, "utility": utility})
 
 
