@@ -27,7 +27,7 @@ from jaxnew.training import train
 ARGUMENTS = Arguments(__doc__, "budget", "runs", "overwrite", "debug_nans")
 
 _PARTS = ("train", "validation", "test")
-_LENGTH = 0.5  # Its steps, in those of the budget: what ten minutes on two cores allow.
+_LENGTH = 0.5  # Its steps, in those of the budget: what ten minutes of a core allow.
 
 
 def main() -> int | None:

@@ -13,7 +13,7 @@ import pytest
 
 from jaxnew.finiteness import cause_of
 from jaxnew.policy import make_method
-from jaxnew.ppo import Hyperparameters, PPOConfig
+from jaxnew.ppo import Hyperparameters, Learner, PPOConfig
 from jaxnew.ppo.objective import Minibatch
 from jaxnew.rollout.contract import RolloutBatch, RolloutConfig
 from jaxnew.sampling import AvailableSet
@@ -80,6 +80,14 @@ def batch_of(params: Any, seed: int, value_scale: float) -> dict[str, np.ndarray
 def as_batch(data: dict[str, np.ndarray]) -> RolloutBatch:
     data = dict(data)
     return RolloutBatch(available=AvailableSet(data.pop("ids"), data.pop("mask")), **data)
+
+
+def metrics_of(learner: Learner, learn: Any, params: Any, data: dict[str, np.ndarray]) -> Any:
+    """What `learn`, that of `learner`, says of a first update."""
+    fresh = learner.optimizer.init(params)
+    batch, hp = as_batch(data), Hyperparameters()
+    *_, metrics = learn(jax.random.key(0), params, fresh, batch, hp, ACTIONS, NO_STEP)
+    return metrics
 
 
 @pytest.mark.oracle
@@ -195,15 +203,7 @@ def test_failures_of_a_rollout_are_foretold_from_it(config: PPOConfig) -> None:
     shapes = learner.method.init(jax.random.key(0), jnp.zeros(4), D)
     params = numpy_policy.randomized(shapes, seed=1)
     data = batch_of(make_method("ours").init(jax.random.key(0), jnp.zeros(4), D), 4, 1.0)
-    *_, metrics = jax.jit(learner.learn)(
-        jax.random.key(0),
-        params,
-        learner.optimizer.init(params),
-        as_batch(data),
-        Hyperparameters(),
-        ACTIONS,
-        NO_STEP,
-    )
+    metrics = metrics_of(learner, jax.jit(learner.learn), params, data)
     ends = data["done"] if config.time_limits_are_ends else data["terminated"]
     is_failure = ends & (data["reward"] < data["value"])
     assert 0 < is_failure.sum() < ends.sum()
@@ -277,15 +277,7 @@ def test_nonfinite_numbers_are_counted(params: Any, broken: str, cause: str) -> 
         params = jax.tree.map(np.copy, params)
         params["encoder"]["Dense_0"]["kernel"][0, 0] = np.nan
     learner = learner_of(CONFIG)
-    *_, metrics = learn_of(CONFIG)(
-        jax.random.key(0),
-        params,
-        learner.optimizer.init(params),
-        as_batch(data),
-        Hyperparameters(),
-        ACTIONS,
-        NO_STEP,
-    )
+    metrics = metrics_of(learner, learn_of(CONFIG), params, data)
     assert metrics["nonfinite/loss"] >= 1
     assert metrics["nonfinite/gradient"] >= 1
     assert cause_of(metrics) == cause
