@@ -18,7 +18,6 @@ from envs_mjx.shape_stacking.engines.contract import (
     check_state,
     is_plausible,
 )
-from envs_mjx.shape_stacking.engines.mjx_pool import Limits
 from envs_mjx.shape_stacking.scene import NUM_SLOTS
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
 
@@ -26,7 +25,7 @@ from envs_mjx.shape_stacking.shapes import NUM_SHAPES, Shape
 # and 3 a cube that tips off an edge ends 5 cm from where it should (docs/shape_stacking.md,
 # "Reference figures", 14): results/shape_stacking/mjx_speed.md.
 SOLVER = scene.Solver(iterations=3, ls_iterations=5)
-MAX_CONTACTS = 48
+MAX_CONTACTS = 48  # Of a world; the deepest are kept.
 
 
 class Mjx:
@@ -55,9 +54,6 @@ class Mjx:
         self,
         settle_steps: int = scene.SETTLE_STEPS,
         num_slots: int = NUM_SLOTS,
-        max_contacts: int = MAX_CONTACTS,
-        solver: scene.Solver = SOLVER,
-        limits: Limits | None = None,
         shapes: tuple[Shape, ...] = (),
     ) -> None:
         """
@@ -65,9 +61,6 @@ class Mjx:
           settle_steps: 1 to 100,000; 300 is the task's.
           num_slots: 2 to 12. Arrays have 12 rows whatever it is; with fewer slots, which is
             cheaper, worlds that use a body beyond them are not `ok`.
-          max_contacts: points of contact in a world, 1 to 1,000; the deepest are kept.
-          solver: upper bounds of Newton's method.
-          limits: of the pairs of bodies that are looked at closely; None for the usual ones.
           shapes: of the user's own.
 
         Raises:
@@ -77,14 +70,11 @@ class Mjx:
         check_settle_steps(settle_steps)
         if not 2 <= num_slots <= NUM_SLOTS:
             raise ValueError(f"num_slots={num_slots} must be 2 to {NUM_SLOTS}.")
-        if not 1 <= max_contacts <= 1_000:
-            raise ValueError(f"max_contacts={max_contacts} must be 1 to 1,000.")
         _mjx_private.check_version()
         self.settle_steps = settle_steps
         self.num_slots = num_slots
         self.shapes = shapes
-        self._limits = limits or Limits()
-        model = mujoco.MjModel.from_xml_string(_scene_text(num_slots, solver, max_contacts))
+        model = mujoco.MjModel.from_xml_string(_scene_text(num_slots))
         with _mjx_private.in_32_bits():
             self._model = _mjx_private.mjx.put_model(model, impl="jax")
             self._data = _mjx_private.mjx.make_data(model, impl="jax")
@@ -138,7 +128,6 @@ class Mjx:
             mjx_pool.with_shapes(self._model, shape_ids, self.shapes),
             self._data,
             mjx_pool.pool(shape_ids, self.shapes),
-            self._limits,
         )
         start = (qpos.ravel(), qvel.ravel(), jnp.zeros(qvel.size))
         end = jax.lax.fori_loop(0, self.settle_steps, lambda _, state: step(state), start)
@@ -148,11 +137,11 @@ class Mjx:
 _State = tuple[jax.Array, jax.Array, jax.Array]
 
 
-def _step(model: Any, data: Any, pool: mjx_pool.Pool, limits: Limits, state: _State) -> _State:
+def _step(model: Any, data: Any, pool: mjx_pool.Pool, state: _State) -> _State:
     """One physics step of qpos, qvel and the last accelerations, flat."""
 
     def find(data: Any) -> _mjx_private.Contacts:
-        return mjx_pool.find_contacts(pool, limits, data.xipos[1:], data.xmat[1:])
+        return mjx_pool.find_contacts(pool, data.xipos[1:], data.xmat[1:])
 
     qpos, qvel, acceleration = state
     data = data.replace(qpos=qpos, qvel=qvel, qacc_warmstart=acceleration)
@@ -160,7 +149,7 @@ def _step(model: Any, data: Any, pool: mjx_pool.Pool, limits: Limits, state: _St
     return data.qpos, data.qvel, data.qacc_warmstart
 
 
-def _scene_text(num_slots: int, solver: scene.Solver, max_contacts: int) -> str:
+def _scene_text(num_slots: int) -> str:
     """A box stands for every shape, since MJX keeps room for four contacts of each two boxes."""
     inertial, box = scene.inertial_text(0), ['<geom type="box" size="0.1 0.1 0.1"/>']
     bodies = [
@@ -170,6 +159,6 @@ def _scene_text(num_slots: int, solver: scene.Solver, max_contacts: int) -> str:
     # Nothing here has damping, which Euler's method would invert the masses once more for.
     extra = (
         '<option jacobian="dense"><flag eulerdamp="disable"/></option>'
-        f'<custom><numeric name="max_contact_points" data="{max_contacts}"/></custom>'
+        f'<custom><numeric name="max_contact_points" data="{MAX_CONTACTS}"/></custom>'
     )
-    return scene.scene_text(bodies, solver=solver, extra=extra)
+    return scene.scene_text(bodies, solver=SOLVER, extra=extra)

@@ -6,7 +6,6 @@ the slots of a world; MJX counts the world itself as body 0, hence the `+ 1`.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -17,25 +16,14 @@ import numpy as np
 from envs_mjx.shape_stacking import scene
 from envs_mjx.shape_stacking.engines._mjx_private import Contacts, private
 from envs_mjx.shape_stacking.engines.hull_contacts import APART, Hull, four_corners, hull_hull
-from envs_mjx.shape_stacking.hulls import HullTable
 from envs_mjx.shape_stacking.shapes import Shape, shape_library
 from envs_mjx.shape_stacking.solids import CLASS_NAMES
 
-
-@dataclass(frozen=True)
-class Limits:
-    """How many pairs of bodies are looked at closely: those whose boxes overlap the deepest.
-
-    In 60 episodes of random play on C the boxes (along the world's axes) of at most 25 pairs of
-    hulls overlapped at a time, 23 in 99.9 % of 10,800 moments; of 9 and 1 of the other kinds.
-
-    Attributes:
-      hull_pairs, mixed_pairs, round_pairs: two hulls; a round body and a hull; two round bodies.
-    """
-
-    hull_pairs: int = 24
-    mixed_pairs: int = 24
-    round_pairs: int = 12
+# How many pairs of bodies are looked at closely (two hulls; a round body and a hull; two round
+# bodies): those whose boxes overlap the deepest. In 60 episodes of random play on C the boxes
+# (along the world's axes) of at most 25 pairs of hulls overlapped at a time, 23 in 99.9 % of 10,800
+# moments; of 9 and 1 of the other kinds.
+HULL_PAIRS, MIXED_PAIRS, ROUND_PAIRS = 24, 24, 12
 
 
 class Pool(NamedTuple):
@@ -72,6 +60,7 @@ class Pool(NamedTuple):
 def _constants(shapes: tuple[Shape, ...] = ()) -> dict[str, np.ndarray]:
     """What `pool` and `with_shapes` look up, per shape or per class, f32 and int32."""
     library = shape_library(shapes)
+    hulls = library.hulls
     values = {
         "label": library.class_labels,
         "s": library.s,
@@ -79,14 +68,7 @@ def _constants(shapes: tuple[Shape, ...] = ()) -> dict[str, np.ndarray]:
         "center": library.center_of_mass,
         "inertia": library.principal_inertia,
         "axes": library.principal_quaternion,
-        "has_hull": library.hulls.has_hull,
-    }
-    return _in_32_bits(values) | hull_constants(library.hulls)
-
-
-def hull_constants(hulls: HullTable) -> dict[str, np.ndarray]:
-    """What `pool` looks up of the hulls, per class, f32 and int32."""
-    values = {
+        "has_hull": hulls.has_hull,
         "vertices": hulls.vertices,
         "face_vertices": hulls.face_vertices,
         "face_normals": hulls.face_normals,
@@ -95,10 +77,6 @@ def hull_constants(hulls: HullTable) -> dict[str, np.ndarray]:
         "edge_directions": _edge_directions(hulls.edge_normals),
         "edge_points": np.take_along_axis(hulls.vertices, hulls.edges[:, :, :1], axis=1),
     }
-    return _in_32_bits(values)
-
-
-def _in_32_bits(values: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     return {k: v.astype(np.float32) if v.dtype == np.float64 else v for k, v in values.items()}
 
 
@@ -148,12 +126,11 @@ def with_shapes(model: Any, shape_ids: jax.Array, shapes: tuple[Shape, ...] = ()
     )
 
 
-def find_contacts(pool: Pool, limits: Limits, centers: jax.Array, axes: jax.Array) -> Contacts:
+def find_contacts(pool: Pool, centers: jax.Array, axes: jax.Array) -> Contacts:
     """Where bodies touch each other and the table.
 
     Args:
       pool: n slots.
-      limits: of the pairs.
       centers: f32[n, 3] centres of mass, m.
       axes: f32[n, 3, 3] columns are the axes of the bodies.
     """
@@ -163,9 +140,9 @@ def find_contacts(pool: Pool, limits: Limits, centers: jax.Array, axes: jax.Arra
     found = [
         _table_hulls(pool, corners),
         _table_rounds(pool, centers, lengths),
-        _hull_pairs(pool, limits.hull_pairs, gaps, centers, axes),
-        _mixed_pairs(pool, limits.mixed_pairs, gaps, centers, axes),
-        _round_pairs(pool, limits.round_pairs, gaps, centers, lengths),
+        _hull_pairs(pool, gaps, centers, axes),
+        _mixed_pairs(pool, gaps, centers, axes),
+        _round_pairs(pool, gaps, centers, lengths),
     ]
     return Contacts(*(jnp.concatenate(parts) for parts in zip(*found, strict=True)))
 
@@ -232,12 +209,10 @@ def _table_rounds(pool: Pool, centers: jax.Array, lengths: jax.Array) -> Contact
     return _table_contacts(points, depth, is_one)
 
 
-def _hull_pairs(
-    pool: Pool, limit: int, gaps: jax.Array, centers: jax.Array, axes: jax.Array
-) -> Contacts:
+def _hull_pairs(pool: Pool, gaps: jax.Array, centers: jax.Array, axes: jax.Array) -> Contacts:
     """Up to four contacts of two hulls."""
     i, j = _pairs(len(centers))
-    chosen, is_near = _nearest(pool.is_hull[i] & pool.is_hull[j], gaps, limit)
+    chosen, is_near = _nearest(pool.is_hull[i] & pool.is_hull[j], gaps, HULL_PAIRS)
     first, second = jnp.asarray(i)[chosen], jnp.asarray(j)[chosen]
     turned = _turned(pool, centers, axes)
     one, two = (jax.tree.map(lambda x, which=which: x[which], turned) for which in (first, second))
@@ -247,13 +222,11 @@ def _hull_pairs(
     return _contacts(distance, position, normal, first + 1, second + 1)
 
 
-def _mixed_pairs(
-    pool: Pool, limit: int, gaps: jax.Array, centers: jax.Array, axes: jax.Array
-) -> Contacts:
+def _mixed_pairs(pool: Pool, gaps: jax.Array, centers: jax.Array, axes: jax.Array) -> Contacts:
     """Up to two contacts of a round body, which is the first, and a hull."""
     i, j = _pairs(len(centers))
     is_swapped = pool.is_hull[i] & pool.is_round[j]
-    chosen, is_near = _nearest(is_swapped | (pool.is_round[i] & pool.is_hull[j]), gaps, limit)
+    chosen, is_near = _nearest(is_swapped | (pool.is_round[i] & pool.is_hull[j]), gaps, MIXED_PAIRS)
     first = jnp.where(is_swapped, j, i)[chosen]
     second = jnp.where(is_swapped, i, j)[chosen]
     size = jnp.stack([pool.radius, pool.half_length, pool.half_length], axis=-1)
@@ -266,12 +239,10 @@ def _mixed_pairs(
     return _contacts(distance, position, normal, first + 1, second + 1)
 
 
-def _round_pairs(
-    pool: Pool, limit: int, gaps: jax.Array, centers: jax.Array, lengths: jax.Array
-) -> Contacts:
+def _round_pairs(pool: Pool, gaps: jax.Array, centers: jax.Array, lengths: jax.Array) -> Contacts:
     """One contact of two round bodies."""
     i, j = _pairs(len(centers))
-    chosen, is_near = _nearest(pool.is_round[i] & pool.is_round[j], gaps, limit)
+    chosen, is_near = _nearest(pool.is_round[i] & pool.is_round[j], gaps, ROUND_PAIRS)
     first, second = jnp.asarray(i)[chosen], jnp.asarray(j)[chosen]
     ends = (centers - lengths, centers + lengths)
     one, other = jax.vmap(private().closest_segment_to_segment_points)(

@@ -32,7 +32,7 @@ class Found(NamedTuple):
 @jax.jit
 def _find(ids: jax.Array, centers: jax.Array, axes: jax.Array) -> mjx_pool.Contacts:
     pool = mjx_pool.pool(ids)
-    return mjx_pool.find_contacts(pool, mjx_pool.Limits(), centers, axes)
+    return mjx_pool.find_contacts(pool, centers, axes)
 
 
 def contacts(
