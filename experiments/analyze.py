@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from experiments.flags import Arguments
+from experiments.flags import TRAINED, Arguments
 from experiments.reports.production import Cell, Source
 from experiments.reports.runs import policies
 from experiments.reports.searches import GRIDS, search
@@ -26,21 +26,7 @@ from experiments.reports.studies import NAMES, study_runs
 from experiments.reports.study_report import write_study
 from jaxnew.task.places import UsageError, check_output
 
-ARGUMENTS = Arguments(
-    __doc__,
-    "task",
-    "method",
-    "representation",
-    "representation_budget",
-    "split",
-    "split_seed",
-    "budget",
-    "runs",
-    "workers",
-    "set",
-    "trust",
-    "debug_nans",
-)
+ARGUMENTS = Arguments(__doc__, *TRAINED, "runs", "workers", "set", "trust", "debug_nans")
 ARGUMENTS.define(
     "string",
     "study",
@@ -57,10 +43,7 @@ ARGUMENTS.define("bool", "dry_run", False, "Of a search, only say what is missin
 ARGUMENTS.define("string", "out", None, "Where to write; default: `analysis/` beside the runs.")
 
 _OF_STUDIES = ("run", "encoder", "episodes")
-_OF_SEARCHES = (
-    *("task", "method", "representation", "representation_budget", "split", "split_seed"),
-    *("budget", "runs", "set", "seeds", "steps", "dry_run"),
-)
+_OF_SEARCHES = (*TRAINED, "runs", "set", "seeds", "steps", "dry_run")
 
 
 def main() -> None:

@@ -44,12 +44,9 @@ def main() -> None:
         made = record(
             ARGUMENTS.task,
             ARGUMENTS.ids,
-            output=ARGUMENTS.output,
-            universe=ARGUMENTS.universe,
             representation=ARGUMENTS.representation if ARGUMENTS.is_given("representation") else "",
             num_recordings=ARGUMENTS.recordings,
-            budget=ARGUMENTS.budget,
-            overwrite=ARGUMENTS.overwrite,
+            **ARGUMENTS.of("output", "universe", "budget", "overwrite"),
         )
         describe(made)
         return

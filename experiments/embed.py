@@ -51,16 +51,11 @@ def main() -> int | None:
         encoder = embed(
             ARGUMENTS.task,
             ARGUMENTS.representation,
-            budget=ARGUMENTS.budget,
             seed=ARGUMENTS.seed if ARGUMENTS.is_given("seed") else REPRESENTATION_SEED,
-            split=ARGUMENTS.split,
-            split_seed=ARGUMENTS.split_seed,
-            set=ARGUMENTS.set,
             num_recordings=ARGUMENTS.recordings,
             stores_drawn=ARGUMENTS.stores_drawn,
             workdir=ARGUMENTS.path,
-            runs=ARGUMENTS.runs,
-            overwrite=ARGUMENTS.overwrite,
+            **ARGUMENTS.of("budget", "split", "split_seed", "set", "runs", "overwrite"),
         )
         if encoder.is_finished:
             print_report(encoder)

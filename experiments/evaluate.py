@@ -111,10 +111,7 @@ def evaluated(run: Run, record: bool | Path | str) -> Evaluation:
     """What the flags ask of a run."""
     return run.evaluate(
         record=record,
-        episodes=ARGUMENTS.episodes,
-        set_size=ARGUMENTS.set_size,
-        grows_from=ARGUMENTS.grows_from,
-        growth=ARGUMENTS.growth,
+        **ARGUMENTS.of("episodes", "set_size", "grows_from", "growth"),
         greedy=ARGUMENTS.deterministic,
         seed=ARGUMENTS.evaluation_seed,
         **drawn_from(run),

@@ -27,11 +27,8 @@ def main() -> int | None:
     run = finetune(
         ARGUMENTS.run,
         is_scratch=ARGUMENTS.scratch,
-        budget=ARGUMENTS.budget,
-        seed=ARGUMENTS.seed,
-        set=ARGUMENTS.set,
+        **ARGUMENTS.of("budget", "seed", "set", "overwrite"),
         workdir=ARGUMENTS.path,
-        overwrite=ARGUMENTS.overwrite,
         num_workers=ARGUMENTS.workers,
     )
     return run.interrupted_by

@@ -79,6 +79,11 @@ _SHARED: dict[str, tuple[str, Any, str]] = {
     ),
     "debug_nans": ("bool", False, "Stop at the operation that makes a NaN."),
 }
+# Flags that say what is trained, and on what.
+TRAINED = (
+    *("task", "method", "representation", "representation_budget"),
+    *("split", "split_seed", "budget"),
+)
 _OPTIONS: dict[str, dict[str, Any]] = {
     "workers": {"lower_bound": 0},
     "recordings": {"lower_bound": 1},
@@ -130,6 +135,10 @@ class Arguments:
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._values, name)
+
+    def of(self, *names: str) -> dict[str, Any]:
+        """Values of flags by their names, for a function whose arguments are called like them."""
+        return {name: getattr(self, name) for name in names}
 
     def is_given(self, name: str) -> bool:
         """Whether a flag stands on the command line."""

@@ -14,27 +14,13 @@ import os
 
 import jax
 
-from experiments.flags import Arguments
+from experiments.flags import TRAINED, Arguments
 from experiments.reports.sweeps import show_sweep
 from jaxnew.cores import available_cores
 from jaxnew.sweeping import sweep
 from jaxnew.task.places import UsageError
 
-ARGUMENTS = Arguments(
-    __doc__,
-    "task",
-    "method",
-    "representation",
-    "representation_budget",
-    "split",
-    "split_seed",
-    "budget",
-    "workdir",
-    "runs",
-    "overwrite",
-    "set",
-    "debug_nans",
-)
+ARGUMENTS = Arguments(__doc__, *TRAINED, "workdir", "runs", "overwrite", "set", "debug_nans")
 ARGUMENTS.define("integers", "seeds", [31, 41, 51, 61, 71], "Seeds of the members.")
 ARGUMENTS.define("multi_string", "vary", [], "hyperparameter=value,value,...")
 ARGUMENTS.define(
@@ -53,18 +39,10 @@ def main() -> int | None:
     found = sweep(
         ARGUMENTS.task,
         ARGUMENTS.representation,
-        seeds=ARGUMENTS.seeds,
         vary=dict(varied(entry) for entry in ARGUMENTS.vary),
-        method=ARGUMENTS.method,
-        budget=ARGUMENTS.budget,
-        split=ARGUMENTS.split,
-        split_seed=ARGUMENTS.split_seed,
-        set=ARGUMENTS.set,
-        representation_budget=ARGUMENTS.representation_budget,
+        **ARGUMENTS.of("seeds", "method", "budget", "split", "split_seed", "set"),
+        **ARGUMENTS.of("representation_budget", "runs", "overwrite", "members_at_once"),
         workdir=ARGUMENTS.path,
-        runs=ARGUMENTS.runs,
-        overwrite=ARGUMENTS.overwrite,
-        members_at_once=ARGUMENTS.members_at_once,
     )
     if found.rows:
         for file in show_sweep(found):
