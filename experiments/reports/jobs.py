@@ -125,15 +125,10 @@ def train_job(source: Source, cell: Cell, seed: int, folder: Path | None = None)
       source: of the cell.
       folder: of the run; default: one that names all that the cell fixes.
     """
-    config = source.config_of(cell)
-    if folder is None:
-        words = [file_name(cell.method), cell.representation]
-        words += ["conditioned"] if cell.conditions_position else []
-        words += [source.domain.split_label, source.budget, str(config.num_updates), str(seed)]
-        folder = source.domain.folder(source.folder) / "-".join(words)
-    own = [f"--seed={seed}", f"--workdir={folder}", *_workers(source)]
-    command = ("train", *_settings(source, cell), *own, *_assignments(source, cell))
-    steps = config.num_updates * config.ppo.steps_per_update
+    folder = folder or _folder(source, cell, "", source.domain.split_label, [seed])
+    workers = [f"--workers={source.workers}"] * (source.workers > 0)
+    command = _command("train", source, cell, f"--seed={seed}", f"--workdir={folder}", *workers)
+    steps = source.steps_of(cell)
     seconds = training_seconds(source, cell.method, steps)
     cost = duration(seconds)
     if seconds is None:
@@ -156,27 +151,32 @@ def sweep_job(
       folder: of the sweep; default: one that names all that the cell fixes.
       vary: values of `--vary`, each `FIELD=VALUE,VALUE...`.
     """
-    domain, config = source.domain, source.config_of(cell)
-    if folder is None:
-        words = ["sweep", file_name(cell.method), cell.representation]
-        words += ["conditioned"] if cell.conditions_position else []
-        words += [domain.split_label] * (domain.split_label != domain.task.default_split)
-        words += [source.budget, str(config.num_updates), *map(str, seeds)]
-        folder = domain.folder(source.folder) / "-".join(words)
+    split = source.domain.split_label
+    split = "" if split == source.domain.task.default_split else split
+    folder = folder or _folder(source, cell, "sweep", split, seeds)
     own = [f"--seeds={','.join(map(str, seeds))}", f"--workdir={folder}"]
-    own += [f"--vary={values}" for values in vary]
-    command = ("sweep", *_settings(source, cell), *own, *_assignments(source, cell))
-    steps = config.num_updates * config.ppo.steps_per_update
+    command = _command("sweep", source, cell, *own, *(f"--vary={values}" for values in vary))
+    steps = source.steps_of(cell)
     num_runs = len(seeds) * math.prod(values.count(",") + 1 for values in vary)
     seconds = training_seconds(source, cell.method, steps * num_runs, num_runs)
     title = f"{cell.label}, {num_runs} runs of {amount(steps)} in one program"
     return Job(title, command, duration(seconds), seconds, folder)
 
 
-def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
-    """Flags of `train` and `sweep` that say what is trained."""
+def _folder(source: Source, cell: Cell, start: str, split: str, seeds: Sequence[int]) -> Path:
+    """One that names all that a cell fixes."""
+    words = [start, file_name(cell.method), cell.representation]
+    words += ["conditioned" * cell.conditions_position, split, source.budget]
+    words += [str(source.config_of(cell).num_updates), *map(str, seeds)]
+    return source.domain.folder(source.folder) / "-".join(filter(None, words))
+
+
+def _command(name: str, source: Source, cell: Cell, *own: str) -> tuple[str, ...]:
+    """`train` or `sweep` with what says what is trained, and flags of its own."""
     table = str(source.given.get(cell.representation, cell.representation))
+    updates = f"num_updates={source.config_of(cell).num_updates}"
     return (
+        name,
         f"--task={source.domain.task.reference}",
         *_split_flags(source),
         f"--method={cell.method}",
@@ -184,6 +184,8 @@ def _settings(source: Source, cell: Cell) -> tuple[str, ...]:
         *([f"--representation_budget={source.stage_one}"] if is_learned(table) else []),
         f"--budget={source.budget}",
         f"--runs={source.folder}",
+        *own,
+        *(f"--set={text}" for text in (*source.assignments, *cell.assignments, updates)),
     )
 
 
@@ -191,15 +193,6 @@ def _split_flags(source: Source) -> list[str]:
     domain = source.domain
     seed = [f"--split_seed={domain.split_seed}"] if domain.split_seed else []
     return [f"--split={domain.split_name}", *seed]
-
-
-def _workers(source: Source) -> list[str]:
-    return [f"--workers={source.workers}"] if source.workers else []
-
-
-def _assignments(source: Source, cell: Cell) -> tuple[str, ...]:
-    updates = f"num_updates={source.config_of(cell).num_updates}"
-    return tuple(f"--set={text}" for text in (*source.assignments, *cell.assignments, updates))
 
 
 def training_seconds(source: Source, method: str, steps: float, num_runs: int = 1) -> float | None:

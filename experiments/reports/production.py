@@ -139,12 +139,10 @@ class Source:
             config = replace(config, num_updates=updates)
         return config
 
-    def table_of(self, representation: str) -> RepresentationTable | None:
-        """The table that was given for a representation; None if none was."""
-        path = self.given.get(representation)
-        if path is None:
-            return None
-        return load_table(path)
+    def steps_of(self, cell: Cell) -> int:
+        """Environment steps of a run of a cell."""
+        config = self.config_of(cell)
+        return config.num_updates * config.ppo.steps_per_update
 
     def embed_folder(self, representation: str) -> Path:
         """Where `embed` keeps a representation."""
@@ -159,7 +157,8 @@ def find(source: Source, cell: Cell) -> dict[int, RunRecord]:
       UsageError: two runs of one seed fit, so that it is not clear which one is meant.
     """
     wanted = _setting(identity(source.config_of(cell)))
-    table = source.table_of(cell.representation)
+    given = source.given.get(cell.representation)
+    table = None if given is None else load_table(given)
     found: dict[int, RunRecord] = {}
     for run in policies_below(source.domain.folder(source.folder)):
         config, seed = run.config, int(run.config["seed"])

@@ -42,9 +42,8 @@ class Grid:
         Raises:
           UsageError: no run can have such a value.
         """
-        config = source.config_of(cell)
-        steps = float(config.num_updates * config.ppo.steps_per_update)
-        assignments = (*source.assignments, self.assignment(config.ppo, value))
+        assignment = self.assignment(source.config_of(cell).ppo, value)
+        steps, assignments = float(source.steps_of(cell)), (*source.assignments, assignment)
         return replace(source, steps=source.steps or steps, assignments=assignments)
 
 
