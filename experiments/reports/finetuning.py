@@ -15,7 +15,6 @@ from experiments.reports.asking import Asked, answers_of
 from experiments.reports.curves import RunCurve, reference_curves
 from experiments.reports.jobs import Job, duration, training_seconds
 from experiments.reports.paper import paper_value
-from experiments.reports.plots import Color, Metric
 from experiments.reports.production import Cell, Source
 from experiments.reports.runs import Group, read_runs
 from jaxnew.results import Question
@@ -23,21 +22,6 @@ from jaxnew.task.methods import trained_ids, variant_of
 from jaxnew.training import CONTINUED
 
 _KINDS = {"warm": "fine-tuned", "scratch": "from scratch"}
-
-
-@dataclass(frozen=True)
-class FinetuneCurves:
-    """All that the figure shows.
-
-    Attributes:
-      curves: by label, e.g. `ours, fine-tuned`, one per seed, of the training episodes.
-      references: by label, means of policies that learn nothing on the test actions.
-      metric: of all.
-    """
-
-    curves: dict[str, tuple[RunCurve, ...]]
-    references: dict[str, float]
-    metric: Metric
 
 
 @dataclass(frozen=True)
@@ -91,12 +75,9 @@ class Tuning:
         return total
 
 
-def make_finetuned(tuning: Tuning, groups: Sequence[Group], num_episodes: int) -> FinetuneCurves:
-    """Finds or makes the fine-tuning runs of pretrained groups, and the zero-shot lines.
-
-    Args:
-      groups: one of `ours` and one of `nearest-neighbour`.
-      num_episodes: of the evaluations behind the lines.
+def make_finetuned(tuning: Tuning, groups: Sequence[Group]) -> dict[str, list[RunCurve]]:
+    """Finds or makes the fine-tuning runs of pretrained groups; of each kind of them its curves of
+    the training episodes, one per seed, under a label such as `ours, fine-tuned`.
     """
     curves = {}
     for group in groups:
@@ -109,9 +90,8 @@ def make_finetuned(tuning: Tuning, groups: Sequence[Group], num_episodes: int) -
                     job.run()
                 (found,) = read_runs([job.folder])
                 runs.append(RunCurve(*found.curve(metric)))
-            curves[f"{variant_of(method).policy}, {name}"] = tuple(runs)
-    ours = next(group for group in groups if group.config["method"] == "ours")
-    return FinetuneCurves(curves, zero_shot(tuning.source, ours, num_episodes), ours.metric)
+            curves[f"{variant_of(method).policy}, {name}"] = runs
+    return curves
 
 
 def zero_shot(source: Source, group: Group, num_episodes: int) -> dict[str, float]:
@@ -134,12 +114,19 @@ def zero_shot(source: Source, group: Group, num_episodes: int) -> dict[str, floa
     return references
 
 
-def finetune_figure(content: FinetuneCurves, title: str) -> Figure:
-    """The curves of the training episodes, and the zero-shot lines."""
+def finetune_figure(
+    tuning: Tuning, groups: Sequence[Group], num_episodes: int, title: str
+) -> Figure:
+    """The curves of the training episodes, and the zero-shot lines.
+
+    Args:
+      groups: pretrained, one of `ours` and one of `nearest-neighbour`.
+      num_episodes: of the evaluations behind the lines.
+    """
+    curves = make_finetuned(tuning, groups)
+    ours = next(group for group in groups if group.config["method"] == "ours")
+    lines = zero_shot(tuning.source, ours, num_episodes)
     palette = plots.hls_palette(10)
-    colors: list[Color] = [palette[3], palette[2], palette[9], palette[8]]
-    settings = [
-        (label, color, runs)
-        for (label, runs), color in zip(content.curves.items(), colors, strict=True)
-    ]
-    return reference_curves(settings, list(content.references.items()), content.metric, title)
+    colors = [palette[place] for place in (3, 2, 9, 8)]
+    settings = list(zip(curves, colors, curves.values(), strict=True))
+    return reference_curves(settings, list(lines.items()), ours.metric, title)

@@ -19,7 +19,7 @@ from experiments.reports.drawing import (
 )
 from experiments.reports.figure_list import FIGURES, PaperFigure, number_of
 from experiments.reports.films import FilmOptions, check_films, film_run
-from experiments.reports.finetuning import Tuning, finetune_figure, make_finetuned
+from experiments.reports.finetuning import Tuning, finetune_figure
 from experiments.reports.jobs import Job, announce, embed_job, evaluation_seconds, training_jobs
 from experiments.reports.production import Cell, Source, find
 from experiments.reports.results import as_csv, as_markdown, result_rows
@@ -212,8 +212,8 @@ def draw(number: str, settings: Sequence[Setting], out: Path, options: Options) 
         return write_study(study, out, name, options.has_pdf)
     if figure.kind == "finetune":
         tuning = Tuning(first, options.finetune_steps)
-        curves = make_finetuned(tuning, groups, options.episodes)
-        return plots.save(finetune_figure(curves, title), out / f"{name}.png", options.has_pdf)
+        picture = finetune_figure(tuning, groups, options.episodes, title)
+        return plots.save(picture, out / f"{name}.png", options.has_pdf)
     if figure.kind == "curves":
         return draw_curves(name, title, groups, out, options.has_pdf, note)
     for group in groups:

@@ -47,28 +47,28 @@ def test_fine_tuning_is_drawn_from_its_runs(
     write_evaluation(paths[0], "test", 0.7, set_size=50, num_actions=256)
     write_evaluation(paths[0], "test", 0.8, set_size=256, num_actions=256)
     groups = [groups_at(path)[0] for path in paths]
-    content = make_finetuned(tuning, groups, 1000)
+    curves = make_finetuned(tuning, groups)
     assert made == []
-    assert {label: runs[0].values.tolist() for label, runs in content.curves.items()} == {
+    assert {label: runs[0].values.tolist() for label, runs in curves.items()} == {
         "ours, fine-tuned": [0.5],
         "ours, from scratch": [0.25],
         "discrete, fine-tuned": [0.5],
         "discrete, from scratch": [0.25],
     }
     whole = paper_value("Grid World", "ours_zero_shot_whole_test_set", "test")
-    assert list(content.references.items()) == [
+    assert list(zero_shot(source, groups[0], 1000).items()) == [
         ("jaxnew, zero-shot, sets as in training (50)", 0.7),
         ("paper, zero-shot, sets as in training", paper_value("Grid World", "ours", "test").mean),
         ("jaxnew, zero-shot, all at once (256)", 0.8),
         ("paper, zero-shot, all at once", whole.mean),
     ]
-    figure = finetuning.finetune_figure(content, "title")
+    figure = finetuning.finetune_figure(tuning, groups, 1000, "title")
     heights = [float(line.get_ydata()[0]) for line in figure.axes[0].lines]
     assert heights[:4] == [50.0, 25.0, 50.0, 25.0]
     assert heights[4] == 70.0
     # What is not there is made: from the run it goes on with, and beside it from scratch.
     with pytest.raises(Exception, match="finetune-warm-3"):
-        make_finetuned(Tuning(source, 768.0), groups, 1000)
+        make_finetuned(Tuning(source, 768.0), groups)
     assert made[0][:2] == ("finetune", f"--run={paths[0]}")
 
 
