@@ -21,7 +21,6 @@ from experiments.reports.plots import (
     Color,
     Metric,
     new_figure,
-    set_title,
     tidy,
 )
 
@@ -95,7 +94,7 @@ def learning_curves(
     handles, labels = _curve_legend(settings)
     num_columns = 2 if max(map(len, labels)) <= _LONG_LABEL else 1
     num_rows = -(-len(labels) // num_columns)
-    figure = new_figure(4.6 * len(splits), 3.5 + 0.17 * num_rows)
+    figure = new_figure(4.6 * len(splits), 3.5 + 0.17 * num_rows, title)
     panels = figure.subplots(1, len(splits), sharey=True, squeeze=False)[0]
     unit = _Unit.of([run for s in settings for runs in s.runs.values() for run in runs], metric)
     papers = _papers(settings)
@@ -124,7 +123,6 @@ def learning_curves(
         handler_map={tuple: HandlerTuple(ndivide=1, pad=0)},
         **LEGEND,
     )
-    set_title(figure, title)
     return figure
 
 
@@ -236,7 +234,7 @@ def reference_curves(
       metric: of the vertical axis.
       title: of the figure.
     """
-    figure = new_figure(7.4, 4.4 + 0.09 * (len(settings) + len(lines)))
+    figure = new_figure(7.4, 4.4 + 0.09 * (len(settings) + len(lines)), title)
     axes = figure.subplots()
     unit = _Unit.of([run for _, _, runs in settings for run in runs], metric)
     for label, color, runs in settings:
@@ -253,5 +251,4 @@ def reference_curves(
     unit.finish(axes, "Environment steps on the new actions")
     axes.set_ylabel(f"{metric.name}, training episodes", fontsize=9, color=INK)
     figure.legend(loc="outside lower center", ncols=2, **LEGEND)
-    set_title(figure, title)
     return figure

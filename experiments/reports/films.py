@@ -104,9 +104,8 @@ def film_run(
             _replace_films(out, Path(name))
     table = out.with_suffix(".csv")
     table.write_text(tables.csv_text(rows), encoding="utf-8")
-    picture = sheet(stills, title)
-    if filming.criterion:
-        picture = ranked_sheet(stills, Metric.of(metric), filming.criterion, title)
+    ranked = (Metric.of(metric), filming.criterion) if filming.criterion else ()
+    picture = sheet(stills, title, *ranked)
     return [*plots.save(picture, out.with_suffix(".png")), table, *films]
 
 
@@ -250,55 +249,41 @@ def choose(successes: Sequence[bool]) -> tuple[int, str]:
     return first, f"episode {first}, first successful of {numbers} ({share})"
 
 
-def sheet(stills: Sequence[Still], title: str = "") -> Figure:
-    """The last pictures of all episodes, with their numbers and outcomes.
-
-    Args:
-      stills: of each.
-      title: of the sheet; the share of successes is added.
-    """
-    labels = [
-        f"episode {still.number}: {SUCCESS if still.is_success else FAILURE}" for still in stills
-    ]
-    return _pictures(stills, labels, _title(title, stills, "successful"))
-
-
-def ranked_sheet(
-    stills: Sequence[Still], metric: Metric, criterion: str, title: str = ""
+def sheet(
+    stills: Sequence[Still],
+    title: str = "",
+    metric: Metric | None = None,
+    criterion: str = "successful",
 ) -> Figure:
-    """The last pictures of the best and of the worst episodes, with their metric above each.
+    """The last pictures of episodes in rows of five, labelled in the colours of their outcomes.
 
     Args:
-      stills: of all episodes; up to ten of them are shown, from best to worst.
-      metric: of their values.
-      criterion: of success.
+      stills: of all episodes.
       title: of the sheet; the share of successes is added.
+      metric: up to ten are shown, from best to worst, with their values of it. None: all of them,
+        with their outcomes.
+      criterion: of success.
     """
-    ranked = sorted(stills, key=lambda still: -still.value)
-    if len(ranked) > 2 * _NUM_COLUMNS:
-        ranked = ranked[:_NUM_COLUMNS] + ranked[-_NUM_COLUMNS:]
-        title += f", best and worst of {len(stills)}"
-    labels = [f"{metric.text(s.value)}{metric.unit} (episode {s.number})" for s in ranked]
-    return _pictures(ranked, labels, _title(title, stills, criterion))
-
-
-def _pictures(stills: Sequence[Still], labels: Sequence[str], title: str) -> Figure:
-    """Pictures in rows of five, with a label above each in the colour of its outcome."""
-    num_rows = -(-len(stills) // _NUM_COLUMNS)
-    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4)
+    share = f"{sum(still.is_success for still in stills)} of {len(stills)} {criterion}"
+    if metric is None:
+        shown = list(stills)
+        labels = [f"episode {s.number}: {SUCCESS if s.is_success else FAILURE}" for s in shown]
+    else:
+        shown = sorted(stills, key=lambda still: -still.value)
+        if len(shown) > 2 * _NUM_COLUMNS:
+            shown = shown[:_NUM_COLUMNS] + shown[-_NUM_COLUMNS:]
+            title += f", best and worst of {len(stills)}"
+        labels = [f"{metric.text(s.value)}{metric.unit} (episode {s.number})" for s in shown]
+    num_rows = -(-len(shown) // _NUM_COLUMNS)
+    title = f"{title} ({share})" if title else share
+    figure = plots.new_figure(2.4 * _NUM_COLUMNS, 2.6 * num_rows + 0.4, title)
     every = figure.subplots(num_rows, _NUM_COLUMNS, squeeze=False).ravel()
-    for axes, still, label in zip(every, stills, labels, strict=False):
+    for axes, still, label in zip(every, shown, labels, strict=False):
         axes.imshow(still.picture, interpolation="none")
         axes.set_xticks([])
         axes.set_yticks([])
         axes.spines[:].set_color(plots.GRID_COLOR)
         axes.set_title(label, fontsize=9, color=_GOOD if still.is_success else _BAD)
-    for axes in every[len(stills) :]:
+    for axes in every[len(shown) :]:
         axes.set_axis_off()
-    plots.set_title(figure, title)
     return figure
-
-
-def _title(title: str, stills: Sequence[Still], criterion: str) -> str:
-    share = f"{sum(still.is_success for still in stills)} of {len(stills)} {criterion}"
-    return f"{title} ({share})" if title else share

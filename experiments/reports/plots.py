@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import colorsys
 import io
+import itertools
 import textwrap
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -15,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
@@ -32,7 +32,8 @@ PAPER_COLOR = "#5b6472"  # Of the paper's numbers, whatever the method.
 _TRAIN_ALPHA, _TEST_ALPHA = 0.25, 0.8  # docs/method.md, "Figures".
 _TEST_HATCH = "///"
 _COVER = {"facecolor": "white", "edgecolor": "none", "pad": 0.5, "alpha": 0.8}
-_ANCHOR_DASHES: tuple[Any, ...] = (":", "-.", "--", "-")
+_ANCHOR: dict[str, Any] = {"color": INK, "linewidth": 1.1}
+_ANCHOR_DASHES = (":", "-.", "--", "-")
 
 
 LEGEND: dict[str, Any] = {"frameon": False, "fontsize": 8.5, "labelcolor": INK}
@@ -128,12 +129,13 @@ def bars(
       title: of the figure.
       footnote: below it, e.g. what the error bars are.
     """
-    figure = new_figure(max(4.4, 1.6 + 2.1 * len(settings)), 4.2)
+    figure = new_figure(max(4.4, 1.6 + 2.1 * len(settings)), 4.2, title)
     axes = figure.subplots()
     ticks: list[tuple[float, str]] = []
     num_lines = 1 + max(max(s.own_note.count("\n"), s.paper_note.count("\n")) for s in settings)
     end = _axis_end(settings, metric)
-    dashes = _anchor_dashes(settings)
+    anchors = dict.fromkeys(name for setting in settings for name in setting.anchors)
+    dashes = dict(zip(anchors, itertools.cycle(_ANCHOR_DASHES), strict=False))
     for position, setting in enumerate(settings):
         sides: list[tuple[str, Mapping[str, Bar], Color | str, str]] = [
             ("jaxnew", setting.own, setting.color, setting.own_note)
@@ -147,7 +149,8 @@ def bars(
                 if split in by_split:
                     _draw_bar(axes, x, by_split[split], split, color, metric, end)
         for name, mean in setting.anchors.items():
-            _draw_anchor(axes, position, metric.scale * mean, dashes[name])
+            ends, height = [position - 0.46, position + 0.46], metric.scale * mean
+            axes.plot(ends, [height] * 2, linestyle=dashes[name], zorder=3.5, **_ANCHOR)
         axes.annotate(
             textwrap.fill(setting.label, 26),
             (position, 0.0),
@@ -179,14 +182,13 @@ def bars(
         "bbox_to_anchor": (0.5, 1.0),
         "borderaxespad": 0.2,
     }
-    handles += [Line2D([], [], color=INK, linewidth=1.1, linestyle=d) for d in dashes.values()]
+    handles += [Line2D([], [], linestyle=style, **_ANCHOR) for style in dashes.values()]
     labels += list(dashes)
     num_columns = max(2, min(len(labels), int(0.9 * figure.get_figwidth() / _legend_entry(labels))))
     axes.legend(handles, labels, ncols=num_columns, **above, **LEGEND)
     footnote = "\n".join(line for line in (footnote, _beyond(settings, metric, end)) if line)
     if footnote:
         figure.supxlabel(footnote, fontsize=7.5, color=FAINT_INK)
-    set_title(figure, title)
     return figure
 
 
@@ -201,18 +203,6 @@ def _axis_end(settings: Sequence[BarSetting], metric: Metric) -> float:
     ]
     highest = metric.scale * max((max(bar.mean, bar.high) for bar in bars), default=0.0)
     return metric.limit if metric.limit is not None and metric.limit >= highest else 1.12 * highest
-
-
-def _anchor_dashes(settings: Sequence[BarSetting]) -> dict[str, Any]:
-    """A style of lines for each anchor of any setting."""
-    names = list(dict.fromkeys(name for setting in settings for name in setting.anchors))
-    return {name: _ANCHOR_DASHES[i % len(_ANCHOR_DASHES)] for i, name in enumerate(names)}
-
-
-def _draw_anchor(axes: Axes, position: int, height: float, dashes: Any) -> None:
-    """A line across one setting."""
-    ends = [position - 0.46, position + 0.46]
-    axes.plot(ends, [height] * 2, color=INK, linewidth=1.1, linestyle=dashes, zorder=3.5)
 
 
 def _beyond(settings: Sequence[BarSetting], metric: Metric, end: float) -> str:
@@ -289,7 +279,7 @@ def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: s
       title: of the figure.
     """
     width = 4.6 * len(panels)
-    figure = new_figure(width, 4.8)
+    figure = new_figure(width, 4.8, title)
     colors = hls_palette(len(class_names))
     shown: dict[str, Any] = {}
     for axes, panel in zip(figure.subplots(1, len(panels), squeeze=False)[0], panels, strict=True):
@@ -317,7 +307,6 @@ def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: s
         **narrow,
         **LEGEND,
     )
-    set_title(figure, title)
     return figure
 
 
@@ -339,15 +328,11 @@ def save(figure: Figure, path: Path, pdf: bool = False) -> list[Path]:
     return list(options)
 
 
-def new_figure(width: float, height: float) -> Figure:
+def new_figure(width: float, height: float, title: str = "") -> Figure:
     figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure
-
-
-def set_title(figure: Figure, title: str) -> None:
     if title:
         figure.suptitle(title, fontsize=11, fontweight="bold", color=INK)
+    return figure
 
 
 def tidy(axes: Axes) -> None:

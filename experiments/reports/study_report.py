@@ -131,7 +131,8 @@ def as_markdown(study: Study) -> str:
 
 def study_figure(study: Study) -> Figure:
     """Mean and deviation over seeds against the axis, a line per setting; the paper's dashed."""
-    figure = plots.new_figure(5.4, 4.0)
+    title = study.title.replace("-", " ")
+    figure = plots.new_figure(5.4, 4.0, title[0].upper() + title[1:])
     axes = figure.subplots()
     scale = study.metric.scale
     settings = study.settings
@@ -163,6 +164,4 @@ def study_figure(study: Study) -> Figure:
     axes.set_ylabel(study.metric.name, fontsize=9, color=plots.INK)
     plots.tidy(axes)
     figure.legend(loc="outside lower center", ncols=2, **plots.LEGEND)
-    title = study.title.replace("-", " ")
-    plots.set_title(figure, title[0].upper() + title[1:])
     return figure

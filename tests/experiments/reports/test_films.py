@@ -159,7 +159,7 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
         Still(number, value >= 1.5, value, np.full((8, 8, 3), 20 * number, np.uint8))
         for number, value in enumerate(values)
     ]
-    figure = films.ranked_sheet(stills, Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    figure = films.sheet(stills, "Figure 8", Metric.of("final_height"), "at least 1.5 m")
     title = "Figure 8, best and worst of 12 (7 of 12 at least 1.5 m)"
     assert figure.get_suptitle() == title
     shown = [(a.get_title(), int(a.images[0].get_array()[0, 0, 0]) // 20) for a in figure.axes]
@@ -171,7 +171,7 @@ def test_a_ranked_sheet_shows_the_best_and_the_worst() -> None:
     colors = [axes.title.get_color() for axes in figure.axes]
     assert len(set(colors[:5])) == len(set(colors[5:])) == 1
     assert colors[0] != colors[5]
-    few = films.ranked_sheet(stills[:3], Metric.of("final_height"), "at least 1.5 m", "Figure 8")
+    few = films.sheet(stills[:3], "Figure 8", Metric.of("final_height"), "at least 1.5 m")
     assert few.get_suptitle() == "Figure 8 (1 of 3 at least 1.5 m)"
     assert [axes.get_title()[:5] for axes in few.axes[:3]] == ["3.250", "1.000", "0.500"]
 

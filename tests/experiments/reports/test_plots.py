@@ -149,7 +149,7 @@ def test_the_legend_is_not_wider_than_the_picture() -> None:
     labels = np.unique(domain.universe.class_labels[domain.split.test])
     points = np.column_stack([labels, labels]).astype(float)
     figure = tsne_scatter([Scatter(points, labels)] * 2, names)
-    figure.canvas.draw()
+    figure.draw_without_rendering()
     (legend,) = figure.legends
     extent = legend.get_window_extent()
     assert 0.5 * figure.bbox.width < extent.width < figure.bbox.width
