@@ -178,12 +178,6 @@ def share_saved(whole: Timing, without: Timing, of: Timing | None = None) -> dic
     return {"wall": saved.wall_s / base.wall_s, "cpu": saved.cpu_s / base.cpu_s}
 
 
-def markdown(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    """A table."""
-    lines = [header, ["---"] * len(header), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
 class Report:
     """Prints results as rows and, with `--output`, appends each as a JSON line with `FIELDS`.
 

@@ -17,8 +17,8 @@ import numpy as np
 
 from envs_mjx.shape_stacking.engines import Engine, make_engine
 from envs_mjx.shape_stacking.shapes import NUM_SHAPES
-from experiments.benchmarks import _measure as m
 from experiments.flags import Arguments
+from experiments.reports import tables
 from experiments.untrained import stacking, towers
 
 ARGUMENTS = Arguments(__doc__)
@@ -55,12 +55,7 @@ def engines_of(physics: str) -> dict[str, Engine]:
     return engines | ({"MJX": make_engine("mjx")} if physics == "mjx" else {})
 
 
-def columns_of(engines: dict[str, Engine]) -> Columns:
-    """All figures on each engine."""
-    return {name: towers.measured(engine) for name, engine in engines.items()}
-
-
-def figures_table(columns: Columns) -> str:
+def figures_table(columns: Columns) -> list[str]:
     """The checks; values that are off by more than the tolerance are bold."""
     rows = []
     for found in zip(*columns.values(), strict=True):
@@ -68,17 +63,17 @@ def figures_table(columns: Columns) -> str:
         spec = first.spec if isinstance(first.spec, str) else f"{first.spec:.3f}"
         tolerance = "" if first.tolerance is None else f"{first.tolerance:g}"
         rows.append([str(first.check), first.what, spec, tolerance, *map(_shown, found)])
-    return m.markdown(["check", "what", "reference", "tolerance", *columns], rows)
+    return tables.table(["check", "what", "reference", "tolerance", *columns], rows)
 
 
-def differences_table(columns: Columns, one: str, other: str) -> str:
+def differences_table(columns: Columns, one: str, other: str) -> list[str]:
     """The checks in which two engines differ by more than 5 mm (cosines: 0.005)."""
     rows = [
         [str(a.check), a.what, f"{a.value:.4f}", f"{b.value:.4f}", f"{b.value - a.value:+.4f}"]
         for a, b in zip(columns[one], columns[other], strict=True)
         if not abs(a.value - b.value) <= _DIFFERENT_M
     ]
-    return m.markdown(["check", "what", one, other, "difference"], rows)
+    return tables.table(["check", "what", one, other, "difference"], rows)
 
 
 def _shown(row: towers.Row) -> str:
@@ -88,7 +83,7 @@ def _shown(row: towers.Row) -> str:
     return text if abs(row.value - row.spec) <= row.tolerance else f"**{text}**"
 
 
-def anchors_table(engines: dict[str, Engine], episodes: int) -> str:
+def anchors_table(engines: dict[str, Engine], episodes: int) -> list[str]:
     """Mean +- its standard error over the episodes."""
     envs, rows = [stacking.OpenStacking(engine) for engine in engines.values()], []
     for name in stacking.NAMES:
@@ -100,7 +95,7 @@ def anchors_table(engines: dict[str, Engine], episodes: int) -> str:
             cells += [f"{heights.mean():.3f} +- {error:.3f}", f"{found['reward'].mean():.3f}"]
         rows.append(cells)
     measured = [f"{what}, {name}" for name in engines for what in ("height", "reward")]
-    return m.markdown(["policy", "height, reference", "reward, reference", *measured], rows)
+    return tables.table(["policy", "height, reference", "reward, reference", *measured], rows)
 
 
 def main() -> None:
@@ -113,13 +108,13 @@ def main() -> None:
     command = f"python -m experiments.benchmarks.stacking_spec {' '.join(sys.argv[1:])}"
     print(f"    {command.rstrip()}\n\n{', '.join(names)}. Values beyond the tolerance are bold.\n")
     print("## Reference figures (m)\n")
-    columns = columns_of(engines)
-    print(figures_table(columns))
+    columns = {name: towers.measured(engine) for name, engine in engines.items()}
+    print(*figures_table(columns), sep="\n")
     if has_mjx:
         print("\n## Where MJX and C with several contacts differ by more than 0.005\n")
-        print(differences_table(columns, "several", "MJX"))
+        print(*differences_table(columns, "several", "MJX"), sep="\n")
     print(f"\n## Policies without training, {episodes} episodes, mean +- standard error\n")
-    print(anchors_table(engines, episodes))
+    print(*anchors_table(engines, episodes), sep="\n")
 
 
 if __name__ == "__main__":

@@ -7,6 +7,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
+from experiments.reports import tables
 from experiments.reports.plots import Metric
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.storage import config as config_lib
@@ -113,7 +114,7 @@ class Anchors:
         )
         names = [f"{Metric.of(metric).name.lower()} [95 % interval]" for metric in metrics]
         cells = ["policy", "actions", *names]
-        return [title, "", _line(cells), _line(["---"] * len(cells))]
+        return [title, "", *tables.table(cells, [])]
 
 
 def changed_settings(task: Task, plain: Mapping[str, Any] | None) -> dict[str, Any]:
@@ -178,8 +179,4 @@ def table_row(policy: str, part: str, summary: Summary) -> str:
     for name, values in summary.items():
         mean, low, high = (Metric.of(name).text(values[key]) for key in ("mean", "low", "high"))
         cells.append(f"{mean} [{low}, {high}]")
-    return _line([policy, part, *cells])
-
-
-def _line(cells: Sequence[str]) -> str:
-    return "| " + " | ".join(cells) + " |"
+    return tables.line([policy, part, *cells])

@@ -86,8 +86,3 @@ def test_arithmetic_of_costs() -> None:
     assert found == m.Cost(1.5, 3.25)
     costs = [m.Cost(1.0, 30.0), m.Cost(2.0, 10.0), m.Cost(9.0, 20.0)]
     assert m.Cost.median(costs) == m.Cost(2.0, 20.0)
-
-
-@pytest.mark.unit
-def test_a_table() -> None:
-    assert m.markdown(["a", "b"], [["1", "2"]]) == "| a | b |\n| --- | --- |\n| 1 | 2 |"
