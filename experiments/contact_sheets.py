@@ -19,8 +19,7 @@ from envs_host.create.drawing import OBSERVATION_SIZE, draw
 from envs_host.create.episode import Episode
 from envs_host.create.geometry import WORLD_SIZE
 from envs_host.create.layout import Layout
-from envs_host.create.levels import load_level
-from envs_host.create.levels.registry import BUILT_IN_NAMES
+from envs_host.create.levels import TASK_NAMES, load_level
 from envs_host.create.sprites import Sprite
 from envs_host.create.tools import Tool, ToolClass, all_tools
 from experiments.flags import Arguments
@@ -29,7 +28,6 @@ from jaxnew.task.places import check_output
 ARGUMENTS = Arguments(__doc__)
 ARGUMENTS.define("string", "out", "results/create", "Folder of the two pictures.")
 
-SMOKE_LEVEL = "GoalTest"
 NUM_EXAMPLES = 3
 
 _INK, _FAINT, _PAPER, _FRAME = (45, 52, 64), (122, 130, 143), (255, 255, 255), (214, 218, 224)
@@ -52,9 +50,7 @@ def main() -> None:
 def levels_sheet() -> Image.Image:
     """The start of every level without noise; in a corner, the agent's first frame."""
     cells = []
-    for name in BUILT_IN_NAMES:
-        if name == SMOKE_LEVEL:
-            continue
+    for name in TASK_NAMES:
         level = load_level(name)
         sprites = list(Episode(_shown(Layout(level)), CreateConfig()).world.sprites())
         people = draw(sprites, "people", _LEVEL_SIZE)

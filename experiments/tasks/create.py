@@ -15,7 +15,7 @@ import numpy as np
 
 from envs_host.create.config import VERSION, CreateRules, RewardConfig
 from envs_host.create.hosting import CreateHost
-from envs_host.create.levels import load_level
+from envs_host.create.levels import TASK_NAMES, load_level
 from envs_host.create.play import NUM_STATES, STATE_SIZE
 from envs_host.create.recorder import PoolRecorder
 from envs_host.create.tools import (
@@ -45,20 +45,6 @@ from jaxnew.task.places import UsageError
 from jaxnew.task.presentation import ActionStudy, Film, Filming, Measured, Presentation
 from jaxnew.task.task import HostDomain, Play, Task
 
-LEVELS = (
-    "Push",
-    "Obstacle",
-    "Seesaw",
-    "Navigate",
-    "Ladder",
-    "Cannon",
-    "Belt",
-    "Buckets",
-    "Collide",
-    "Moving",
-    "Basket",
-    "Funnel",
-)
 FRAME_SIZE = 84
 _MIX_SEED = 0
 _MEASURED = Measured(training={"ours": 470.0}, evaluation=100.0)
@@ -230,7 +216,7 @@ def create_task(level: str, *, with_subgoals: bool = True, is_analysis: bool = F
     """One level as a task.
 
     Args:
-      level: of `LEVELS`, or a level file of the user's own.
+      level: of `TASK_NAMES`, or a level file of the user's own.
       with_subgoals: False: subgoals and the target's hit are worth nothing.
       is_analysis: the tools of the analysis, 3 degrees apart, with its split and studies.
     """
@@ -292,7 +278,7 @@ _SPLITS = {name: published(partial(published_split, name)) for name in ("default
 
 def _tasks() -> dict[str, Task]:
     tasks = {}
-    for level in LEVELS:
+    for level in TASK_NAMES:
         for with_subgoals in (True, False):
             for is_analysis in (False, True):
                 task = create_task(level, with_subgoals=with_subgoals, is_analysis=is_analysis)

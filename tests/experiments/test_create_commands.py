@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from envs_host.create.levels import load_level
+from envs_host.create.levels import TASK_NAMES, load_level
 from envs_host.create.tools import (
     analysis_split,
     angle_test_ids,
@@ -26,7 +26,6 @@ from envs_host.create.tools import (
     published_split,
     tool_universe,
 )
-from experiments.tasks.create import LEVELS
 from jaxnew.actions import ActionSplit
 from jaxnew.representation.table import RepresentationTable
 from jaxnew.storage import metrics
@@ -232,7 +231,7 @@ def test_new_tools_are_recorded_encoded_and_placed(
 
 def test_every_level_is_there() -> None:
     levels = {run.task.split("-")[1] for run in RUNS.values()}
-    assert levels == {level.lower() for level in LEVELS}
+    assert levels == {level.lower() for level in TASK_NAMES}
 
 
 @pytest.mark.parametrize("name", NAMES)

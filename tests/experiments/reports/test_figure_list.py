@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from envs_host.create.levels import TASK_NAMES
 from experiments.reports.figure_list import FIGURES, number_of
 from experiments.reports.paper_figures import parse_given
-from experiments.tasks.create import LEVELS
 from jaxnew.task.places import UsageError
 from tests.experiments.handwritten import source_of
 
@@ -36,7 +36,7 @@ def test_figures_show_the_tasks_of_the_paper() -> None:
         for number, figure in FIGURES.items()
     }
     main = ["obstacle", "push", "seesaw"]
-    further = sorted(level.lower() for level in LEVELS if level.lower() not in main)
+    further = sorted(level.lower() for level in TASK_NAMES if level.lower() not in main)
     for number in ("4", "6", "7a", "7b", "9a", "9b", "9c", "20", "21", "24"):
         assert shown[number] == main, number
     assert shown["18"] == further
