@@ -61,16 +61,12 @@ def towers(engine: Engine, count: int) -> tuple[Bodies, np.ndarray, np.ndarray]:
 
 def bare_loop(shape_ids: np.ndarray, num_steps: int) -> Callable[[Any, Any], None]:
     """Steps a model of its own for each world, in this thread; the models are made beforehand."""
-    models: dict[bytes, mujoco.MjModel] = {}
-    for row in shape_ids:
-        if row.tobytes() not in models:
-            models[row.tobytes()] = world_model(row)
-    worlds = [models[row.tobytes()] for row in shape_ids]
-    data = {key: mujoco.MjData(model) for key, model in models.items()}
+    models = {row.tobytes(): world_model(row) for row in np.unique(shape_ids, axis=0)}
+    made = {key: (model, mujoco.MjData(model)) for key, model in models.items()}
+    worlds = [made[row.tobytes()] for row in shape_ids]
 
     def loop(qpos: np.ndarray, qvel: np.ndarray) -> None:
-        for k, model in enumerate(worlds):
-            state = data[shape_ids[k].tobytes()]
+        for k, (model, state) in enumerate(worlds):
             mujoco.mj_resetData(model, state)
             state.qpos[:], state.qvel[:] = qpos[k].ravel(), qvel[k].ravel()
             mujoco.mj_step(model, state, num_steps)
