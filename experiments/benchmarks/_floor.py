@@ -8,6 +8,7 @@ numbers, Adam.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
@@ -95,29 +96,14 @@ def update_bytes(shapes: Shapes) -> tuple[int, int]:
     return cached, memory
 
 
-@dataclass(frozen=True)
-class Rates:
-    """What the machine was seen to reach, per second.
-
-    Attributes:
-      operations: floating-point operations in a matrix product.
-      cached_bytes: bytes read and written by a copy that stays in the caches.
-      memory_bytes: bytes read and written by a copy that does not.
-    """
-
-    operations: float
-    cached_bytes: float
-    memory_bytes: float
-
-
-def floor_seconds(shapes: Shapes, rates: Rates) -> dict[str, float]:
+def floor_seconds(shapes: Shapes, rates: Mapping[str, float]) -> dict[str, float]:
     """Seconds per update that operations and bytes take, the larger of the two, and their sum.
 
     The larger one is the floor of a program that computes and moves at the same time.
     """
     cached, memory = update_bytes(shapes)
-    operations_s = update_operations(shapes) / rates.operations
-    bytes_s = cached / rates.cached_bytes + memory / rates.memory_bytes
+    operations_s = update_operations(shapes) / rates["operations"]
+    bytes_s = cached / rates["cached_bytes"] + memory / rates["memory_bytes"]
     return {
         "operations_s": operations_s,
         "bytes_s": bytes_s,
@@ -136,8 +122,12 @@ _COPIES = {
 }
 
 
-def measure_rates(report: m.Report) -> Rates:
-    """Times products and copies; returns the best rates."""
+def measure_rates(report: m.Report) -> dict[str, float]:
+    """Times products and copies; the best of what the machine was seen to reach, per second.
+
+    `operations`: of floating-point numbers, in a matrix product; `cached_bytes` and `memory_bytes`:
+    read and written by a copy that stays in the caches, and by one that does not.
+    """
     subjects: dict[str, m.Subject] = {}
     work: dict[str, tuple[str, float]] = {}
     for sizes in _PRODUCTS:
@@ -156,7 +146,7 @@ def measure_rates(report: m.Report) -> Rates:
         report.timing(name, timing, work={unit: amount}, how="a loop in one program")
         rate = amount / min(cost.wall_s for cost in timing.costs)
         best[unit] = max(rate, best.get(unit, 0.0))
-    return Rates(**best)
+    return best
 
 
 def _products(rows: int, width: int, times: int) -> m.Subject:

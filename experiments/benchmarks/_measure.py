@@ -234,9 +234,7 @@ class Report:
             repeats=len(walls),
             wall_s=wall,
             cpu_s=cpu,
-            compile_s=None
-            if compilation is None
-            else {"wall": compilation.wall_s, "cpu": compilation.cpu_s},
+            compile_s=compilation and {"wall": compilation.wall_s, "cpu": compilation.cpu_s},
             rates=rates,
         )
         low, middle, high = (1e3 * wall[name] for name in ("min", "median", "max"))

@@ -80,7 +80,8 @@ def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
     """Random play of one level, drawn and not, and the share of the physics."""
     names: tuple[Observation, ...] = ("gray", "none")
     envs = {name: CreateEnv(level, config=CreateConfig(observation=name)) for name in names}
-    timings = report.measure({name: _subject(env, num_decisions) for name, env in envs.items()})
+    play = {k: partial(random_play, env, num_decisions=num_decisions) for k, env in envs.items()}
+    timings = report.measure({name: m.Subject(call, _seed_of) for name, call in play.items()})
     for name, timing in timings.items():
         report.timing(
             f"{level}, observation {name}",
@@ -94,17 +95,14 @@ def measure_play(report: m.Report, level: str, num_decisions: int) -> None:
     report.values(f"{level}, share of drawing", share, how="1 - none / gray")
     report.values(
         f"{level}, share of the physics",
-        {"cpu": share_of_physics(partial(random_play, envs["gray"], 0, num_decisions))},
+        {"cpu": share_of_physics(partial(play["gray"], seed=0))},
         how="inside Space.step / all, observation gray, auto-reset",
         num_envs=1,
     )
 
 
-def _subject(env: CreateEnv, num_decisions: int) -> m.Subject:
-    def play(seed: int) -> int:
-        return random_play(env, seed, num_decisions)
-
-    return m.Subject(play, lambda key: (int(jax.random.bits(key, dtype="uint16")),))
+def _seed_of(key: jax.Array) -> tuple[int]:
+    return (int(jax.random.bits(key, dtype="uint16")),)
 
 
 def measure_frames(report: m.Report, num_frames: int) -> None:

@@ -39,18 +39,14 @@ class Game:
     Attributes:
       description: what it is.
       num_actions: actions are `0..num_actions-1`.
-      moves_per_decision: simulated moves in one step.
       reset: key -> carry, for one environment. The carry holds the observation.
-      step: (key, carry, action) -> (carry, reward), with auto-reset unless the game says not.
-      has_auto_reset: whether ended episodes start again.
+      step: (key, carry, action) -> (carry, reward); with auto-reset, but for ours when it is raw.
     """
 
     description: str
     num_actions: int
-    moves_per_decision: int
     reset: Callable[[jax.Array], Any]
     step: Callable[[jax.Array, Any, jax.Array], tuple[Any, jax.Array]]
-    has_auto_reset: bool = True
 
 
 def grid_world(has_auto_reset: bool = True) -> Game:
@@ -69,10 +65,8 @@ def grid_world(has_auto_reset: bool = True) -> Game:
     return Game(
         "jaxnew GridWorld-v0, 9x9 with lava, f32[81], five moves a decision",
         NUM_SKILLS,
-        NUM_MOVES,
         reset,
         step,
-        has_auto_reset,
     )
 
 
@@ -99,7 +93,6 @@ def navix_game() -> Game:
     return Game(
         "Navix LavaGap 9x9, symbolic uint8[9, 9, 3]: another game, one move a decision",
         len(env.action_set),
-        1,
         env.reset,
         step,
     )
@@ -122,7 +115,6 @@ def xminigrid_game() -> Game:
     return Game(
         "XLand-MiniGrid Empty 9x9, view uint8[7, 7, 2]: another game, one move a decision",
         env.num_actions(params),
-        1,
         lambda key: env.reset(params, key),
         step,
     )
@@ -141,7 +133,6 @@ def gymnax_game() -> Game:
     return Game(
         "gymnax FourRooms 13x13, map f32[13, 13, 2]: another game, one move a decision",
         env.num_actions,
-        1,
         lambda key: env.reset(key, params),
         step,
     )
@@ -202,13 +193,13 @@ def main() -> None:
     for num_envs in (4,) if report.is_quick else (32, 1024):
         timings = report.measure({k: subject(v, num_envs, num_steps) for k, v in games.items()})
         for name, game in games.items():
-            decisions = num_envs * num_steps
+            decisions, moves = num_envs * num_steps, 1 if name in PEERS else NUM_MOVES
             report.timing(
                 name if name in PEERS else f"grid_world, {name}",
                 timings[name],
-                work={"decisions": decisions, "moves": decisions * game.moves_per_decision},
+                work={"decisions": decisions, "moves": decisions * moves},
                 num_envs=num_envs,
-                includes=["auto-reset"] * game.has_auto_reset + ["random actions"],
+                includes=["auto-reset"] * (name != "raw") + ["random actions"],
                 how=f"{game.description}; a scan of {num_steps} steps from fresh starts",
             )
         if "auto-reset" not in games:

@@ -95,9 +95,22 @@ def placements(num_worlds: int) -> Inputs:
 
 
 def compare(
-    report: m.Report, subjects: dict[str, m.Subject], num_worlds: int, num_steps: int
+    report: m.Report,
+    engines: dict[str, Engine],
+    num_worlds: int,
+    num_steps: int,
+    has_bare_loop: bool = False,
 ) -> None:
-    """A line for each, and the ratio of the first two."""
+    """Placements in one compiled program of each engine; before them, in the bare loop. A line for
+    each, and the ratio of the first two.
+    """
+    inputs, subjects = placements(num_worlds), {}
+    if has_bare_loop:
+        loop = bare_loop(np.asarray(inputs(jax.random.key(0))[0]), num_steps)
+        subjects["bare loop"] = m.Subject(
+            lambda _, qpos, qvel: loop(np.asarray(qpos), np.asarray(qvel)), inputs
+        )
+    subjects |= {name: m.compiled(engine.settle, inputs) for name, engine in engines.items()}
     timings, steps = report.measure(subjects), num_worlds * num_steps
     for name, timing in timings.items():
         report.timing(
@@ -109,32 +122,6 @@ def compare(
         )
     one, other, *_ = timings
     report.ratio(f"{num_worlds} worlds, {one} / {other}", timings[one], timings[other])
-
-
-def compare_c(report: m.Report, num_worlds: int, num_steps: int) -> None:
-    """Placements in one compiled program, on one core and on all, and the bare loop."""
-    inputs = placements(num_worlds)
-    loop = bare_loop(np.asarray(inputs(jax.random.key(0))[0]), num_steps)
-    one, every = MujocoC(num_steps, num_threads=1), MujocoC(num_steps)
-    subjects = {
-        "bare loop": m.Subject(
-            lambda _, qpos, qvel: loop(np.asarray(qpos), np.asarray(qvel)), inputs
-        ),
-        "one core": m.compiled(one.settle, inputs),
-        "all cores": m.compiled(every.settle, inputs),
-    }
-    compare(report, subjects, num_worlds, num_steps)
-
-
-def compare_mjx(report: m.Report, num_worlds: int, num_steps: int) -> None:
-    """MJX on the device that jax has, against the C engine on one core."""
-    inputs = placements(num_worlds)
-    mjx, in_c = make_engine("mjx", settle_steps=num_steps), MujocoC(num_steps, num_threads=1)
-    subjects = {
-        "MJX": m.compiled(mjx.settle, inputs),
-        "C on one core": m.compiled(in_c.settle, inputs),
-    }
-    compare(report, subjects, num_worlds, num_steps)
 
 
 def cached_compilation(report: m.Report, num_worlds: int, num_steps: int) -> None:
@@ -158,13 +145,17 @@ def main() -> None:
     report = m.Report("stacking", ARGUMENTS)
     report.add_versions("mujoco", "mujoco-mjx")
     if "mujoco" in ARGUMENTS.engines:
+        num_steps = 5 if report.is_quick else scene.SETTLE_STEPS
         for num_worlds in (2,) if report.is_quick else (1, 20, 60):
-            compare_c(report, num_worlds, 5 if report.is_quick else scene.SETTLE_STEPS)
+            one, every = MujocoC(num_steps, num_threads=1), MujocoC(num_steps)
+            in_c: dict[str, Engine] = {"one core": one, "all cores": every}
+            compare(report, in_c, num_worlds, num_steps, has_bare_loop=True)
     if "mjx" in ARGUMENTS.engines:
         num_steps = 5 if report.is_quick else ARGUMENTS.mjx_steps
         worlds = [2] if report.is_quick else [int(number) for number in ARGUMENTS.mjx_worlds]
         for num_worlds in worlds:
-            compare_mjx(report, num_worlds, num_steps)
+            mjx, one = make_engine("mjx", settle_steps=num_steps), MujocoC(num_steps, num_threads=1)
+            compare(report, {"MJX": mjx, "C on one core": one}, num_worlds, num_steps)
         if not report.is_quick:
             cached_compilation(report, worlds[0], num_steps)
 

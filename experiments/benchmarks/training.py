@@ -229,10 +229,8 @@ def report_floor(report: m.Report, trainer: Trainer, update: m.Timing) -> None:
     }
     how = "counted from the shapes, see experiments/benchmarks/_floor.py"
     report.values("floor: needed per environment step", per_step, how=how)
-    floor, seconds = (
-        _floor.floor_seconds(shapes, _floor.measure_rates(report)),
-        update.median.wall_s,
-    )
+    floor = _floor.floor_seconds(shapes, _floor.measure_rates(report))
+    seconds = update.median.wall_s
     values = {
         **floor,
         "update_s": seconds,

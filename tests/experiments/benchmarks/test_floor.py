@@ -71,7 +71,7 @@ def test_bytes_of_one_update_by_hand() -> None:
 
 @pytest.mark.unit
 def test_floor_is_the_larger_of_operations_and_bytes() -> None:
-    rates = _floor.Rates(operations=1e11, cached_bytes=1e11, memory_bytes=1e10)
+    rates = {"operations": 1e11, "cached_bytes": 1e11, "memory_bytes": 1e10}
     floor = _floor.floor_seconds(PAPER, rates)
     # 10,162,798,592 operations at 1e11; 3,565,158,400 bytes at 1e11 and 126,517,248 at 1e10.
     assert floor["operations_s"] == pytest.approx(0.10162798592)
