@@ -97,21 +97,6 @@ def _seen(state: OpenState) -> jax.Array:
 
 
 @struct.dataclass
-class Move:
-    """What a policy does.
-
-    Attributes:
-      choice: int32[...] index into the available set, or -1 for nothing.
-      position: f32[..., k] m.
-      stop: bool[...].
-    """
-
-    choice: jax.Array
-    position: jax.Array
-    stop: jax.Array
-
-
-@struct.dataclass
 class Moves:
     """What a policy may do.
 
@@ -128,27 +113,27 @@ class Moves:
     name: str = struct.field(pytree_node=False)
     position_dim: int = struct.field(pytree_node=False)
 
-    def sample(self, key: jax.Array) -> Move:
-        """What it does; consumes `key`."""
+    def sample(self, key: jax.Array) -> Action:
+        """What it does, its `id` an index into the available set, or -1; consumes `key`."""
         return self._scripted() if self.name == SCRIPTED else self._random(key)
 
-    def _random(self, key: jax.Array) -> Move:
+    def _random(self, key: jax.Array) -> Action:
         """A uniform choice and position, and perhaps a stop."""
         key_choice, key_position, key_stop = jax.random.split(key, 3)
-        return Move(
+        return Action(
             Categorical.masked(jnp.zeros_like(self.sizes), self.mask).sample(key_choice),
             jax.random.uniform(key_position, (self.position_dim,), minval=-1.0, maxval=1.0),
             jax.random.bernoulli(key_stop, RANDOM[self.name]),
         )
 
-    def _scripted(self) -> Move:
+    def _scripted(self) -> Action:
         """The flat-topped shapes by decreasing s, all on the left cylinder; then nothing more."""
         left_x, number = self.obs[0], self.obs[1].astype(jnp.int32)
         sizes = jnp.where(self.mask, self.sizes, 0.0)
         order = jnp.argsort(-sizes)
         choice = order[jnp.minimum(number, len(order) - 1)]
         is_there = (number < len(order)) & (sizes[choice] > 0.0)
-        return Move(
+        return Action(
             jnp.where(is_there, choice, -1),
             jnp.stack([left_x, jnp.float32(0.0)])[: self.position_dim],
             jnp.bool_(False),
@@ -178,11 +163,11 @@ class StackingAnchor:
         del params
         return Moves(obs, projected[..., 0], mask, self.name, self._position_dim)
 
-    def decode(self, sample: Move, available: AvailableSet, table: jax.Array) -> Action:
+    def decode(self, sample: Action, available: AvailableSet, table: jax.Array) -> Action:
         """The action; an id of -1 places nothing."""
         del table
-        ids = available.id_of(jnp.maximum(sample.choice, 0))
-        return Action(jnp.where(sample.choice < 0, -1, ids), sample.position, sample.stop)
+        ids = available.id_of(jnp.maximum(sample.id, 0))
+        return Action(jnp.where(sample.id < 0, -1, ids), sample.position, sample.stop)
 
 
 def flat_sizes() -> np.ndarray:

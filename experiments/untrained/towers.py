@@ -55,8 +55,9 @@ def stack(engine: Engine, bodies: Bodies, drops: Sequence[Sequence[Drop]]) -> Bo
         now = [row[k] if len(row) > k else (SETTLE_ONLY, 0.0) for row in drops]
         ids = np.array([drop[0] for drop in now], np.int32)
         x = np.array([drop[1] for drop in now], np.float32)
-        placed = _act(bodies, slots, ids, np.stack([x, np.zeros_like(x)], axis=-1))
-        bodies = _where(is_running, settled(engine, placed), bodies)
+        placed = _place(bodies, slots, ids, np.stack([x, np.zeros_like(x)], axis=-1))
+        placed = _chosen(ids >= 0, placed, bodies)
+        bodies = _chosen(is_running, settled(engine, placed), bodies)
         slots = slots + (ids >= 0)
     return bodies
 
@@ -73,20 +74,13 @@ def settled(engine: Engine, bodies: Bodies) -> Bodies:
     return Bodies(bodies.shape_ids, qpos, qvel)
 
 
-def _where(mask: np.ndarray, new: Bodies, old: Bodies) -> Bodies:
-    """The worlds of `new` where bool[n] `mask` is true, those of `old` elsewhere."""
-
-    def choose(one: jax.Array, other: jax.Array) -> jax.Array:
-        return jnp.where(mask.reshape(-1, *[1] * (one.ndim - 1)), one, other)
-
-    return jax.tree.map(choose, new, old)
+_place = jax.jit(jax.vmap(rules.place))
 
 
-@jax.jit
 @jax.vmap
-def _act(bodies: Bodies, slot: jax.Array, shape_id: jax.Array, position: jax.Array) -> Bodies:
-    placed = rules.place(bodies, slot, shape_id, position)
-    return jax.tree.map(lambda new, old: jnp.where(shape_id >= 0, new, old), placed, bodies)
+def _chosen(is_new: jax.Array | np.ndarray, new: Bodies, old: Bodies) -> Bodies:
+    """The worlds of `new` where bool[n] `is_new` is true, those of `old` elsewhere."""
+    return jax.tree.map(lambda one, other: jnp.where(is_new, one, other), new, old)
 
 
 @dataclass(frozen=True)

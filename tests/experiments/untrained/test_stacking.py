@@ -54,8 +54,8 @@ def test_the_script_stacks_flat_shapes_by_size_on_the_left_cylinder() -> None:
     assert not any(bool(action.stop) for action in played)
     # Padding is no shape.
     mask = flat[0] != IDS
-    assert int(IDS[int(moves("scripted", 0, mask).sample(key).choice)]) == flat[1]
-    assert int(moves("scripted", 3, mask).sample(key).choice) == -1
+    assert int(IDS[int(moves("scripted", 0, mask).sample(key).id)]) == flat[1]
+    assert int(moves("scripted", 3, mask).sample(key).id) == -1
     assert moves("scripted", 0, dim=2).sample(key).position.tolist() == [-0.625, 0.0]
     assert moves("scripted", 0, dim=0).sample(key).position.shape == (0,)
 
@@ -69,7 +69,7 @@ def test_random_play_is_uniform_and_stops_as_told() -> None:
         return jax.vmap(moves(name, 2, mask, dim=2).sample)(keys)
 
     half = drawn("random, stops with probability 0.5")
-    counts = np.bincount(np.asarray(half.choice), minlength=6)
+    counts = np.bincount(np.asarray(half.id), minlength=6)
     # Binomial: sqrt(4000 * 0.2 * 0.8) = 25 for choices, 32 for stops; 4 deviations.
     np.testing.assert_allclose(counts, np.where(mask, 800, 0), atol=100)
     assert int(half.stop.sum()) == pytest.approx(2000, abs=128)
