@@ -7,6 +7,7 @@ gradient steps are an epoch: with 1,098 train tools 8 of states, 34 of videos.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 from envs_host.create.poses import FRAMES_SHAPE, POSES_SHAPE, draw_poses
@@ -30,12 +31,10 @@ STATE_HVAE = RepresentationConfig(
     recordings_per_action=464,
     num_steps=80_000,
 )
-VIDEO_HVAE = RepresentationConfig(
+VIDEO_HVAE = replace(
+    STATE_HVAE,
     encoder_width=128,
-    inference_width=128,
     hidden_width=128,
-    action_latent=128,
-    observation_latent=128,
     actions_per_batch=32,
     recordings_per_action=45,
     num_steps=170_000,

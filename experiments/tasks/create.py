@@ -276,16 +276,14 @@ def _with_tools(level: str, with_subgoals: bool, name: str) -> Task:
 _SPLITS = {name: published(partial(published_split, name)) for name in ("default", "full")}
 
 
-def _tasks() -> dict[str, Task]:
-    tasks = {}
-    for level in TASK_NAMES:
-        for with_subgoals in (True, False):
-            for is_analysis in (False, True):
-                task = create_task(level, with_subgoals=with_subgoals, is_analysis=is_analysis)
-                tasks[task.name.removeprefix("create-")] = task
-    return tasks
-
-
+_VARIANTS = [
+    create_task(level, with_subgoals=with_subgoals, is_analysis=is_analysis)
+    for level in TASK_NAMES
+    for with_subgoals in (True, False)
+    for is_analysis in (False, True)
+]
 TASK = create_task("Push")
 # Recordings and encoders name the list of tools that they are of: `create` or `create-analysis`.
-TASKS = {**_tasks(), "analysis": create_task("Push", is_analysis=True)}
+TASKS = {task.name.removeprefix("create-"): task for task in _VARIANTS} | {
+    "analysis": create_task("Push", is_analysis=True)
+}
