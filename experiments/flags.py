@@ -196,7 +196,8 @@ class Arguments:
         lines = [self._doc.strip(), "", "Flags:"]
         for name, text in self._texts.items():
             found = self._values[name].default
-            default = "" if found in (None, []) else f" Default: {_shown(found)}."
+            shown = ",".join(map(str, found)) if isinstance(found, list) else found
+            default = "" if found in (None, []) else f" Default: {shown}."
             wrapped = textwrap.wrap(f"{text}{default}", 94)
             lines += [f"  --{name}", *(f"      {line}" for line in wrapped)]
         if with_absl:
@@ -260,10 +261,6 @@ def _of_absl() -> flags.FlagValues:
             for flag in listed:
                 own[flag.name] = flag
     return own
-
-
-def _shown(value: Any) -> str:
-    return ",".join(map(str, value)) if isinstance(value, list) else str(value)
 
 
 def _at_home(word: str) -> str:

@@ -5,19 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 from experiments.reports import tables
 from experiments.reports.plots import Metric
+from experiments.reports.runs import Group
 from jaxnew.evaluation import EVALUATION_SEED
 from jaxnew.storage import config as config_lib
 from jaxnew.storage.files import read_json, write_json_atomically
 from jaxnew.task.domain import Domain
 from jaxnew.task.places import UsageError
 from jaxnew.task.task import Task
-
-if TYPE_CHECKING:
-    from experiments.reports.runs import Group
 
 FOLDER = "anchors"  # Beside the runs of the task.
 

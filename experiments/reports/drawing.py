@@ -97,7 +97,8 @@ def bars_figure(
     """Train and test bars of the groups with a test evaluation; None if there is no such group."""
     settings, errors = [], []
     for group, color in zip(groups, setting_colors(groups), strict=True):
-        by_split = standard_rows(rows[group.label])
+        standard = [row for row in rows[group.label] if row.is_standard]
+        by_split = {row.actions: row for row in standard if row.actions in BAR_SPLITS}
         if "test" not in by_split:
             continue
         own = {split: Bar(row.mean, row.low, row.high) for split, row in by_split.items()}
@@ -129,19 +130,12 @@ def bars_figure(
     return plots.bars(settings, metric, title, footnote)
 
 
-def standard_rows(rows: Sequence[ResultRow]) -> dict[str, ResultRow]:
-    """By split, the evaluations that the bars show: made as the paper's."""
-    return {row.actions: row for row in rows if row.is_standard and row.actions in BAR_SPLITS}
-
-
 def _note(num_seeds: Sequence[int], steps: float | None) -> str:
     """Seeds and training steps, below a bar."""
     low, high = min(num_seeds), max(num_seeds)
     number = str(high) if low == high else f"{low}-{high}"
     seeds = f"{number} seed{'s' if high > 1 else ''}"
-    if steps is None:
-        return seeds
-    return f"{seeds}\n{plots.amount(steps)}"
+    return seeds if steps is None else f"{seeds}\n{plots.amount(steps)}"
 
 
 def tsne_figures(runs: Sequence[RunRecord]) -> list[tuple[str, Figure]]:

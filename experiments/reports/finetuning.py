@@ -66,13 +66,10 @@ class Tuning:
     @property
     def seconds(self) -> float | None:
         """How long all four curves of all seeds take; None if nobody measured it."""
-        total = 0.0
-        for method in CONTINUED:
-            seconds = self.job(Path("RUN"), method, 0, "warm").seconds
-            if seconds is None:
-                return None
-            total += seconds * len(_KINDS) * len(self.source.seeds)
-        return total
+        each = [self.job(Path("RUN"), method, 0, "warm").seconds for method in CONTINUED]
+        known = [seconds for seconds in each if seconds is not None]
+        times = len(_KINDS) * len(self.source.seeds)
+        return times * sum(known) if len(known) == len(each) else None
 
 
 def make_finetuned(tuning: Tuning, groups: Sequence[Group]) -> dict[str, list[RunCurve]]:

@@ -161,19 +161,15 @@ def missing_episodes(
     """Episodes of the evaluations that the figure still needs, also of runs yet to be made."""
     if figure.kind not in ("bars", "study"):
         return 0
-    missing = 0
-    for group in group_runs(added):
-        for run in group.runs:
-            missing += len(lacking(run, questions_of(figure, group), num_episodes))
+    missing, groups = 0, group_runs(added)
     for source, cell in settings:
         task, found = source.domain.task, find(source, cell)
-        per_run = len(
-            BAR_SPLITS if figure.kind == "bars" else task.shown.studies[figure.study].values
-        )
-        missing += per_run * (len(source.seeds) - len(found))
-        for run in found.values():
-            group = Group(cell.label, task, (run,))
-            missing += len(lacking(run, questions_of(figure, group), num_episodes))
+        asked = BAR_SPLITS if figure.kind == "bars" else task.shown.studies[figure.study].values
+        missing += len(asked) * (len(source.seeds) - len(found))
+        groups += [Group(cell.label, task, (run,)) for run in found.values()]
+    for group in groups:
+        questions = questions_of(figure, group)
+        missing += sum(run.answer(q, num_episodes) is None for run in group.runs for q in questions)
     return missing * num_episodes
 
 
@@ -183,11 +179,6 @@ def questions_of(figure: PaperFigure, group: Group) -> list[Question]:
         return [group.standard(part) for part in BAR_SPLITS]
     kind = kind_of(figure.study, group.task)
     return [kind.asked(group.runs[0], value).question for value in kind.values]
-
-
-def lacking(run: RunRecord, questions: Sequence[Question], num_episodes: int) -> list[Question]:
-    """Questions that a run has no answer to on record."""
-    return [question for question in questions if run.answer(question, num_episodes) is None]
 
 
 def draw(number: str, settings: Sequence[Setting], out: Path, options: Options) -> list[Path]:

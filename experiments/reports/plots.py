@@ -113,9 +113,9 @@ class BarSetting:
     anchors: Mapping[str, float] = field(default_factory=dict)
 
 
-def hls_palette(n: int, l: float = 0.6, s: float = 0.9, h: float = 0.7) -> list[Color]:  # noqa: E741
-    """`n` colours of equal lightness `l` and saturation `s`, evenly spaced in hue from `h`."""
-    return [colorsys.hls_to_rgb((h + i / n) % 1.0, l, s) for i in range(n)]
+def hls_palette(n: int) -> list[Color]:
+    """`n` colours of equal lightness and saturation, evenly spaced in hue."""
+    return [colorsys.hls_to_rgb((0.7 + i / n) % 1.0, 0.6, 0.9) for i in range(n)]
 
 
 def bars(
@@ -175,15 +175,14 @@ def bars(
     handles: list[Any] = [
         Patch(facecolor=PAPER_COLOR, alpha=_TEST_ALPHA, edgecolor="black", hatch=_TEST_HATCH),
         Patch(facecolor=PAPER_COLOR, alpha=_TRAIN_ALPHA),
+        *(Line2D([], [], linestyle=style, **_ANCHOR) for style in dashes.values()),
     ]
-    labels = ["unseen test actions", "train actions"]
+    labels = ["unseen test actions", "train actions", *dashes]
     above: dict[str, Any] = {
         "loc": "lower center",
         "bbox_to_anchor": (0.5, 1.0),
         "borderaxespad": 0.2,
     }
-    handles += [Line2D([], [], linestyle=style, **_ANCHOR) for style in dashes.values()]
-    labels += list(dashes)
     num_columns = max(2, min(len(labels), int(0.9 * figure.get_figwidth() / _legend_entry(labels))))
     axes.legend(handles, labels, ncols=num_columns, **above, **LEGEND)
     footnote = "\n".join(line for line in (footnote, _beyond(settings, metric, end)) if line)
@@ -287,8 +286,7 @@ def tsne_scatter(panels: Sequence[Scatter], class_names: Sequence[str], title: s
             of_class = panel.points[panel.labels == label]
             if len(of_class):
                 shown[name] = axes.scatter(
-                    of_class[:, 0],
-                    of_class[:, 1],
+                    *of_class.T,
                     s=22,
                     color=colors[label],
                     edgecolor="white",

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from experiments.reports import tables
-from experiments.reports.paper import PaperValue, paper_steps, paper_value
+from experiments.reports.paper import paper_steps, paper_value
 from experiments.reports.plots import Metric
 from experiments.reports.runs import Group, RunRecord
 from jaxnew.actions import SPLIT_NAMES
@@ -79,14 +79,13 @@ def result_rows(group: Group) -> list[ResultRow]:
         for e in run.evaluations:
             if group.task.selection_metric in e["metrics"]:
                 found.setdefault(question_of(e), []).append((run, e))
-    order = ("train", "validation", "test")
     rows = [_result_row(group, evaluations) for evaluations in found.values()]
     return sorted(
         rows,
         key=lambda r: (
             not r.is_standard,
             r.checkpoint,
-            order.index(r.actions) if r.actions in order else len(order),
+            SPLIT_NAMES.index(r.actions) if r.actions in SPLIT_NAMES else len(SPLIT_NAMES),
         ),
     )
 
@@ -103,19 +102,22 @@ def _result_row(group: Group, evaluations: list[tuple[RunRecord, dict[str, Any]]
     else:
         low, high = numbers[0]["low"], numbers[0]["high"]
         error = "95 % interval over episodes"
-    paper = _paper_value(group, first)
-    scale = group.metric.scale
+    part, method, environment = first["actions"], group.paper_method, str(group.paper_environment)
+    is_standard = part in SPLIT_NAMES and group.standard(part).is_answered_by(first)
+    paper = None
+    if is_standard and part in ("train", "test") and method is not None:
+        paper = paper_value(environment, method, part, group.paper_figure)
     return ResultRow(
         setting=group.label,
         task=group.task.name,
         method=group.config["method"],
         representation=runs[0].representation,
-        actions=first["actions"],
+        actions=part,
         checkpoint=first["checkpoint"],
         policy=first["policy"],
         set_size=first["set_size"],
         evaluation_seed=first.get("evaluation_seed", EVALUATION_SEED),
-        is_standard=is_standard(group, first),
+        is_standard=is_standard,
         metric=group.task.selection_metric,
         mean=mean,
         low=low,
@@ -127,29 +129,14 @@ def _result_row(group: Group, evaluations: list[tuple[RunRecord, dict[str, Any]]
             np.mean([e["step"] * run.steps_per_update for run, e in evaluations])
         ),
         trained_steps=float(np.mean([run.trained_steps for run in runs])),
-        paper_method=paper and group.paper_method,
+        paper_method=paper and method,
         paper_mean=paper and paper.mean,
         paper_std=paper and paper.std,
         paper_num_seeds=paper and paper.num_seeds,
-        paper_steps=paper and paper_steps(str(group.paper_environment)),
-        difference=paper and scale * (mean - paper.mean),
+        paper_steps=paper and paper_steps(environment),
+        difference=paper and group.metric.scale * (mean - paper.mean),
         runs=tuple(str(run.path) for run in runs),
     )
-
-
-def is_standard(group: Group, evaluation: dict[str, Any]) -> bool:
-    """Whether an evaluation of a run of the group was made as the paper's."""
-    part = evaluation["actions"]
-    return part in SPLIT_NAMES and group.standard(part).is_answered_by(evaluation)
-
-
-def _paper_value(group: Group, evaluation: dict[str, Any]) -> PaperValue | None:
-    """The paper's number for an evaluation that was made as the paper's."""
-    is_bar = evaluation["actions"] in ("train", "test") and is_standard(group, evaluation)
-    if not is_bar or group.paper_method is None:
-        return None
-    environment = str(group.paper_environment)
-    return paper_value(environment, group.paper_method, evaluation["actions"], group.paper_figure)
 
 
 def as_csv(rows: Sequence[ResultRow]) -> str:

@@ -312,14 +312,10 @@ def with_distinct_labels(groups: list[Group]) -> list[Group]:
         if "table_hash" in changes and group.runs[0].table is not None:
             changes["table_hash"] = f"({group.runs[0].table.source})"
         names = [name for name in changes if name != "seed" and not name.startswith("loop.")]
-        names.sort(key=_label_rank)
+        ranks = {group: rank for rank, group in enumerate(_LABEL_ORDER)}
+        names.sort(key=lambda name: ranks.get(name.partition(".")[0], len(ranks)))
         words = [f"{name.rpartition('.')[2]} {changes[name]}" for name in names[:_LABEL_CHANGES]]
         label = ", ".join([group.label, *words])
         number = 1 + sum(done.label.partition(" #")[0] == label for done in labelled)
         labelled.append(replace(group, label=f"{label} #{number}" if number > 1 else label))
     return labelled
-
-
-def _label_rank(name: str) -> int:
-    group = name.partition(".")[0]
-    return _LABEL_ORDER.index(group) if group in _LABEL_ORDER else len(_LABEL_ORDER)

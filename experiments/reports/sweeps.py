@@ -31,7 +31,7 @@ def show_sweep(runs: Runs, out: Path | None = None, stem: str = "sweep") -> list
 
 def as_markdown(runs: Runs) -> str:
     """The table for reading, and what its numbers are."""
-    metric, varied, summary = _metric(runs), runs.varied, runs.summary()
+    metric, varied, summary = Metric.of(runs.task.selection_metric), runs.varied, runs.summary()
     names = [name.removesuffix("_std") for name in summary[0] if name.endswith("_std")]
     rows = []
     for row in summary:
@@ -80,16 +80,12 @@ def sweep_figure(runs: Runs, out: Path, stem: str = "sweep", pdf: bool = False) 
         "sweep",
         axis.replace("_", " "),
         has_log_axis,
-        _metric(runs),
+        Metric.of(runs.task.selection_metric),
         tuple(points),
         "",
         place=runs.task.name.replace("_", " "),
     )
     return plots.save(study_figure(study), out / f"{stem}.png", pdf)
-
-
-def _metric(runs: Runs) -> Metric:
-    return Metric.of(runs.task.selection_metric)
 
 
 def _title(runs: Runs, name: str) -> str:

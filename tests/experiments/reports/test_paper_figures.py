@@ -60,9 +60,9 @@ def test_what_a_figure_lacks_is_counted(tmp_path: Path) -> None:
     (run,) = read_runs([path])
     group = Group("analysed", settings[0][0].domain.task, (run,))
     questions = paper_figures.questions_of(FIGURES["9c"], group)
-    lacking = paper_figures.lacking(run, questions, 100)
-    assert [question.actions for question in lacking] == ["mix-0", "mix-0.4", "mix-0.6", "mix-0.8"]
-    assert paper_figures.lacking(run, questions, 1001) == questions
+    lacking = [question.actions for question in questions if run.answer(question, 100) is None]
+    assert lacking == ["mix-0", "mix-0.4", "mix-0.6", "mix-0.8"]
+    assert all(run.answer(question, 1001) is None for question in questions)
     films = paper_figures.settings_of(FIGURES["8"], source_of("create-push", seeds=(3, 4)))
     assert films[0][0].seeds == (3,)
 

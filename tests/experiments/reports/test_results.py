@@ -9,7 +9,6 @@ import pytest
 
 from envs_mjx.grid_world import skill_universe
 from experiments.reports.paper import paper_value
-from experiments.reports.paper_figures import lacking
 from experiments.reports.production import Cell
 from experiments.reports.results import as_markdown, result_rows
 from experiments.reports.runs import read_runs
@@ -121,8 +120,8 @@ def test_the_train_bar_of_a_fixed_set_is_all_of_it(tmp_path: Path) -> None:
     (run,) = read_runs([path])
     questions = [group.standard(part) for part in ("train", "test")]
     assert questions == [Question("train", None), Question("test", 50)]
-    assert lacking(run, questions, 1000) == []
-    assert lacking(run, questions, 1001) == questions
+    assert all(run.answer(question, 1000) is not None for question in questions)
+    assert all(run.answer(question, 1001) is None for question in questions)
     # With an action that is always available, a whole set is larger than what it is drawn from.
     write_evaluation(path, "train", 0.9, set_size=513, num_actions=512)
     assert questions[0].is_answered_by(read_runs([path])[0].evaluations[-1])
