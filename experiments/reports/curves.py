@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import reduce
 from typing import Any
 
 import numpy as np
@@ -65,9 +66,7 @@ class CurveSetting:
 
 def mean_curve(runs: Sequence[RunCurve]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Steps that all runs have, and there the mean and population deviation over the runs."""
-    common = runs[0].steps
-    for run in runs[1:]:
-        common = np.intersect1d(common, run.steps)
+    common = reduce(np.intersect1d, [run.steps for run in runs])
     values = np.array([run.values[np.isin(run.steps, common)] for run in runs])
     return common, values.mean(axis=0), values.std(axis=0)
 

@@ -82,23 +82,21 @@ def write_study(study: Study, out: Path, stem: str, pdf: bool = False) -> list[P
 
 def as_csv(study: Study) -> str:
     """One line per setting and value."""
-    rows = []
-    for point in study.points:
-        paper = point.paper
-        rows.append(
-            {
-                "study": study.name,
-                "setting": point.setting,
-                study.axis: point.x,
-                "mean": float(point.means.mean()),
-                "std": float(point.means.std()),
-                "num_seeds": len(point.means),
-                "num_episodes": point.num_episodes,
-                "paper": paper and paper.mean,
-                "paper_std": paper and paper.std,
-                "paper_num_seeds": paper and paper.num_seeds,
-            }
-        )
+    rows = [
+        {
+            "study": study.name,
+            "setting": point.setting,
+            study.axis: point.x,
+            "mean": float(point.means.mean()),
+            "std": float(point.means.std()),
+            "num_seeds": len(point.means),
+            "num_episodes": point.num_episodes,
+            "paper": point.paper and point.paper.mean,
+            "paper_std": point.paper and point.paper.std,
+            "paper_num_seeds": point.paper and point.paper.num_seeds,
+        }
+        for point in study.points
+    ]
     return tables.csv_text(rows)
 
 
