@@ -14,7 +14,7 @@ depends on the action alone is computed once for a whole table.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import copy
 from dataclasses import replace
 from typing import Any
 
@@ -118,12 +118,6 @@ class HybridDistribution:
             position=None if position is None else position.mode(),
         )
 
-    @property
-    def failure_loss(self) -> Callable[[HybridSample, jax.Array], jax.Array]:
-        """That of the choice. Raises AttributeError where the choice has none."""
-        of_choice: Callable[[Any, jax.Array], jax.Array] = self.choice.failure_loss
-        return lambda sample, is_failure: of_choice(sample.choice, is_failure)
-
     def _position_at(self, choice: Any) -> Beta | None:
         """The position's distribution f32[..., k], given the choice."""
         if self.position is None or not self.is_conditioned:
@@ -217,6 +211,8 @@ class AuxiliaryMethod(FeatureMethod):
         self._heads = _Heads(0 if is_conditioned else dim, action_spec.has_stop)
         self._position_dim = dim
         self._conditioned = _ConditionedHead(dim, self.network)
+        if getattr(base, "failure_loss", None) is not None:
+            self.failure_loss = self._failure_loss
 
     def init(self, key: jax.Array, obs: jax.Array, representation_size: int) -> dict[str, Any]:
         """Fresh parameters for an observation like `obs`; consumes `key`."""
@@ -230,8 +226,27 @@ class AuxiliaryMethod(FeatureMethod):
                 auxiliary[name] = variables["params"]
         return {**self._base.init(key_base, obs, representation_size), "auxiliary": auxiliary}
 
+    def for_evaluation(self) -> AuxiliaryMethod:
+        """It with the method's own policy for evaluations."""
+        changed = copy.copy(self)
+        changed._base = self._base.for_evaluation()
+        return changed
+
+    def _failure_loss(
+        self,
+        params: dict[str, Any],
+        distribution: HybridDistribution,
+        representations: jax.Array,
+        is_failure: jax.Array,
+    ) -> jax.Array:
+        choice = distribution.choice
+        loss: jax.Array = self._base.failure_loss(params, choice, representations, is_failure)
+        return loss
+
     def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """The method's projection and, conditioned, those of alpha and beta: f32[..., 3 h]."""
+        """The method's projection f32[..., p] and, conditioned, those of alpha and beta:
+        f32[..., p + 2 h].
+        """
         projected = self._base.project(params, representations)
         if not self._is_conditioned:
             return projected
@@ -251,13 +266,13 @@ class AuxiliaryMethod(FeatureMethod):
         self, params: dict[str, Any], features: jax.Array, projected: jax.Array, mask: jax.Array
     ) -> HybridDistribution:
         """The joint distribution; see the method's own."""
-        hidden = self.network.utility_width
-        rows = projected[..., :hidden] if self._is_conditioned else projected
+        num_more = 2 * self.network.utility_width if self._is_conditioned else 0
+        rows, more = jnp.split(projected, [projected.shape[-1] - num_more], axis=-1)
         choice = self._base.distribution_of(params, features, rows, mask)
         heads: Any = self._heads.apply({"params": params["auxiliary"]["heads"]}, features)
         stop, position = heads
         if self._is_conditioned:
-            shares = jnp.split(projected[..., hidden:], 2, axis=-1)
+            shares = jnp.split(more, 2, axis=-1)
             alpha, beta = (
                 apply(self._conditioned, params["auxiliary"][name], features, share)
                 for name, share in zip(("alpha", "beta"), shares, strict=True)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
-import optax
 from flax import struct
 from jax.scipy.special import betaln, digamma
 
@@ -57,22 +56,6 @@ class Categorical:
     def mode(self) -> jax.Array:
         """int32[...] most likely choice, the first of equals."""
         return jax.lax.argmax(self.logits, self.logits.ndim - 1, jnp.int32)
-
-
-@struct.dataclass
-class CautiousCategorical(Categorical):
-    """A choice that knows how likely each entry is a failure.
-
-    Attributes:
-      failure_odds: f32[..., m] log-odds of it, which the logits have taken into account.
-    """
-
-    failure_odds: jax.Array
-
-    def failure_loss(self, choice: jax.Array, is_failure: jax.Array) -> jax.Array:
-        """f32[...] minus the log-probability that it gives to what came of int32[...] choices."""
-        odds = jnp.take_along_axis(self.failure_odds, choice[..., None], axis=-1)[..., 0]
-        return optax.sigmoid_binary_cross_entropy(odds, is_failure.astype(jnp.float32))
 
 
 _INSIDE = 1e-6  # Distance of a sample from 0 and 1: float32 draws of exactly 1 happen.

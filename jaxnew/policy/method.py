@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import jax
 import numpy as np
@@ -14,18 +14,15 @@ from jaxnew.policy.auxiliary import AuxiliaryMethod
 from jaxnew.policy.config import NetworkConfig
 from jaxnew.policy.continuous import ContinuousMethod
 from jaxnew.policy.discrete import DiscreteMethod
-from jaxnew.policy.utility import ModulatedMethod, RandomMethod, UtilityMethod
+from jaxnew.policy.modulated import ModulatedMethod
+from jaxnew.policy.utility import RandomMethod, UtilityMethod
 from jaxnew.sampling import AvailableSet
 
 Params = Any
 
 
 class Distribution(Protocol):
-    """A distribution over samples; a sample is a pytree, stored as it is by PPO.
-
-    One that foretells failures has `failure_loss(sample, is_failure: bool[...]) -> f32[...]` as
-    well, which is minimised beside the objective.
-    """
+    """A distribution over samples; a sample is a pytree, stored as it is by PPO."""
 
     def sample(self, key: jax.Array) -> Any:
         """A draw for every state [...]; consumes `key`."""
@@ -47,8 +44,11 @@ class Distribution(Protocol):
 class PolicyMethod(Protocol):
     """A policy as pure functions of its parameters.
 
-    A method whose distribution and value share work may have `distribution_and_value` as well, with
-    the arguments of `distribution`.
+    It may have more. `distribution_and_value`, with the arguments of `distribution`, where the two
+    share work. `for_evaluation() -> PolicyMethod`, who acts with its parameters where nothing is
+    learned. `failure_loss(params, distribution, representations, is_failure) -> f32[...]`, of the
+    actions f32[..., d] that were taken and whether they failed, which is minimised beside the
+    objective (`jaxnew.policy.modulated`).
     """
 
     name: str
@@ -103,6 +103,12 @@ def distribution_and_value(
         found: tuple[Distribution, jax.Array] = joint(params, obs, projected, mask)
         return found
     return method.distribution(params, obs, projected, mask), method.value(params, obs)
+
+
+def method_of_evaluations(method: PolicyMethod) -> PolicyMethod:
+    """Who acts with a method's parameters where nothing is learned."""
+    changed = getattr(method, "for_evaluation", None)
+    return method if changed is None else cast(PolicyMethod, changed())
 
 
 @dataclass(frozen=True)

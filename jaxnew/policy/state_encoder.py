@@ -159,7 +159,10 @@ class FeatureMethod:
 
     Attributes:
       network: sizes; w below is its `state_width`.
+      failure_loss: see `jaxnew.policy.method.PolicyMethod`; None: it foretells nothing.
     """
+
+    failure_loss: Callable[..., jax.Array] | None = None
 
     def __init__(self, network: NetworkConfig | None = None) -> None:
         self.network = network or NetworkConfig()
@@ -170,6 +173,10 @@ class FeatureMethod:
         return self._critic.init(key, obs, jnp.zeros(self.network.state_width, jnp.float32))[
             "params"
         ]
+
+    def for_evaluation(self) -> Any:
+        """Who acts with its parameters where nothing is learned."""
+        return self
 
     def features(self, params: dict[str, Any], obs: jax.Array) -> jax.Array:
         """f32[..., w] the state feature."""

@@ -10,9 +10,6 @@ and the policy is the softmax of the utilities of the available actions. The fir
 middle weight only ever meet `f` and the last 64 only `a`: `[f, a] @ W = f @ W[:64] + a @ W[64:]`.
 The second term depends on the action alone: `project` computes it once for a whole table, and what
 is left per state and action is an addition, a ReLU and a dot product with 64 numbers.
-
-Of `ModulatedUtility` these 64 numbers depend on the state, and there are 64 more that say how
-likely the action is a failure.
 """
 
 from __future__ import annotations
@@ -22,16 +19,14 @@ from typing import Any, cast
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from jaxnew.environment import Action
 from jaxnew.policy.config import NetworkConfig
-from jaxnew.policy.distributions import Categorical, CautiousCategorical
+from jaxnew.policy.distributions import Categorical
 from jaxnew.policy.state_encoder import Activation, FeatureMethod, StateEncoder, apply
 from jaxnew.sampling import AvailableSet
 
-_UTILITY_GAIN = 0.01  # The initial policy is almost exactly uniform.
-_HIDDEN_GAIN = 2.0**0.5
+UTILITY_GAIN = 0.01  # The initial policy is almost exactly uniform.
 
 
 class Utility(nn.Module):
@@ -42,7 +37,7 @@ class Utility(nn.Module):
     """
 
     network: NetworkConfig = NetworkConfig()
-    gain = _UTILITY_GAIN  # Of all layers but the last.
+    gain = UTILITY_GAIN  # Of all layers but the last.
 
     def setup(self) -> None:
         width, hidden = self.network.state_width, self.network.utility_width
@@ -50,7 +45,7 @@ class Utility(nn.Module):
         self.embed = nn.Dense(width, kernel_init=init)
         self.kernel = self.param("kernel", init, (2 * width, hidden), jnp.float32)
         self.bias = self.param("bias", nn.initializers.zeros, (hidden,), jnp.float32)
-        last = nn.initializers.orthogonal(_UTILITY_GAIN)
+        last = nn.initializers.orthogonal(UTILITY_GAIN)
         self.score = nn.Dense(self.num_scores, kernel_init=last)
 
     @property
@@ -92,46 +87,6 @@ class Utility(nn.Module):
         hidden = jnp.concatenate([repeated, embedded], axis=-1) @ self.kernel + self.bias
         mask = jnp.ones(embedded.shape[:-1], bool)
         return self.scored(features, nn.relu(hidden), mask).logits
-
-
-class ModulatedUtility(Utility):
-    """Utilities whose last weights depend on the state (docs/method.md, "Modulated utility").
-
-        a = ReLU( Lin(d, w)(c) )
-        x = ReLU( Lin(2 w, h)( [f, a] ) )
-        o = sum of Lin(w, h)(f) * x + Lin(w, 1)(f)
-        u = sum of Lin(w, h)(f) * x - k softplus(o)
-
-    In each state it is a network of its own from embeddings to utilities. `o` are the log-odds of a
-    failure, learned from what came of the actions that were taken, so that `-softplus(o)` is the
-    log-probability that there is none; `k` is one number, and the gradient of `u` does not reach
-    `o`. Hidden layers have the usual gain of sqrt(2).
-    """
-
-    gain = _HIDDEN_GAIN
-
-    def setup(self) -> None:
-        super().setup()
-        init = nn.initializers.orthogonal(_UTILITY_GAIN)
-        self.failure = nn.Dense(self.network.utility_width + 1, kernel_init=init)
-        self.caution = self.param("caution", nn.initializers.ones, (), jnp.float32)
-
-    @property
-    def num_scores(self) -> int:
-        """One weight for each number of the hidden layer."""
-        return self.network.utility_width
-
-    def embedded(self, representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., w], the action alone."""
-        return nn.relu(self.embed(representations))
-
-    def scored(self, features: jax.Array, hidden: jax.Array, mask: jax.Array) -> Categorical:
-        """The policy from features f32[..., w] and the hidden layer f32[..., m, h]."""
-        of_failure = self.failure(features)
-        odds = jnp.sum(hidden * of_failure[..., None, :-1], axis=-1) + of_failure[..., -1:]
-        utilities = jnp.sum(hidden * self.score(features)[..., None, :], axis=-1)
-        utilities -= self.caution * nn.softplus(jax.lax.stop_gradient(odds))
-        return CautiousCategorical(Categorical.masked(utilities, mask).logits, odds)
 
 
 class UtilityMethod(FeatureMethod):
@@ -194,45 +149,6 @@ class UtilityMethod(FeatureMethod):
         """The action behind a choice int32[...] from sets [..., m]."""
         del table
         return Action.of(available.id_of(sample))
-
-
-class ModulatedMethod(UtilityMethod):
-    """A utility policy with a `ModulatedUtility` and ReLUs in its state encoder, which reads
-    representations in their own unit.
-
-    That is less their mean, over their deviation: one number, so that the shape of their space
-    stays.
-
-    Args:
-      network: sizes.
-      representations: f32[n, d] those that have the unit; None: they are read as they are.
-    """
-
-    name = "modulated"
-    utility_type = ModulatedUtility
-    activation = staticmethod(nn.relu)
-
-    def __init__(
-        self,
-        network: NetworkConfig | None = None,
-        representations: np.ndarray | None = None,
-    ) -> None:
-        super().__init__(network)
-        seen = np.zeros(1) if representations is None else np.asarray(representations, np.float64)
-        self._mean = np.float32(seen.mean(axis=0))
-        deviation = np.sqrt(seen.var(axis=0).mean())
-        self._unit = np.float32(deviation if deviation > 0 else 1.0)
-
-    def project(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., h]: all that the policy needs of an action, in any state."""
-        return super().project(params, self._in_unit(representations))
-
-    def embed(self, params: dict[str, Any], representations: jax.Array) -> jax.Array:
-        """f32[..., d] -> f32[..., w]: the `a` of the utility."""
-        return super().embed(params, self._in_unit(representations))
-
-    def _in_unit(self, representations: jax.Array) -> jax.Array:
-        return (representations - self._mean) / self._unit
 
 
 class RandomMethod(UtilityMethod):

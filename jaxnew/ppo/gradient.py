@@ -101,7 +101,10 @@ class GradientSteps:
             is_failure=failures(terminated, temporal_differences(*seen, discount)),
         )
         transitions = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), transitions)
-        learning_rate = hyperparameters.learning_rate * self._learning_rate_factor(step)
+        learning_rate = hyperparameters.learning_rate * self._falling_to(0.1, step)
+        of_entropy: Any = hyperparameters.entropy_coefficient
+        of_entropy *= self._falling_to(hyperparameters.final_entropy, step)
+        hyperparameters = replace(hyperparameters, entropy_coefficient=of_entropy)
 
         def gradient_step(carry: tuple[Any, Any], indices: jax.Array) -> tuple[Any, Metrics]:
             params, opt_state = carry
@@ -135,9 +138,10 @@ class GradientSteps:
         metrics |= {finiteness.PREFIX + name: value for name, value in nonfinite.items()}
         return params, opt_state, metrics
 
-    def _learning_rate_factor(self, step: jax.Array) -> jax.Array:
-        """Linear from 1 to 0.1 over `lr_updates`, then constant."""
-        return 1.0 - 0.9 * jnp.minimum(1.0, step.astype(jnp.float32) / self.config.lr_updates)
+    def _falling_to(self, end: float | jax.Array, step: jax.Array) -> jax.Array:
+        """Linear from 1 to `end` over `lr_updates`, then constant."""
+        share = jnp.minimum(1.0, step.astype(jnp.float32) / self.config.lr_updates)
+        return 1.0 - (1.0 - end) * share
 
     def _minibatch_indices(self, key: jax.Array) -> jax.Array:
         """int32[epochs * minibatches, B]: a fresh permutation of all transitions per epoch."""

@@ -19,7 +19,9 @@ class Hyperparameters:
 
     Attributes:
       learning_rate: of Adam at the start; it falls linearly to a tenth over `lr_steps`.
-      entropy_coefficient: weight of the mean entropy.
+      entropy_coefficient: weight of the mean entropy at the start.
+      final_entropy: share of that weight that is left at the end; it falls linearly over
+        `lr_steps`.
       clip: of the probability ratio, and of the value's change.
       discount: gamma.
       gae_lambda: lambda of the advantage estimator.
@@ -31,6 +33,7 @@ class Hyperparameters:
 
     learning_rate: float = 1e-3
     entropy_coefficient: float = 0.05
+    final_entropy: float = 1.0
     clip: float = 0.1
     discount: float = 0.99
     gae_lambda: float = 0.95
@@ -43,6 +46,7 @@ class Hyperparameters:
         ranges = {
             "learning_rate": (0.0, 1.0),
             "entropy_coefficient": (0.0, math.inf),
+            "final_entropy": (0.0, 1.0),
             "clip": (0.0, math.inf),
             "discount": (0.0, 1.0),
             "gae_lambda": (0.0, 1.0),
@@ -141,10 +145,14 @@ def loss(
         - hyperparameters.entropy_coefficient * entropy
     )
     foretold = {}
-    if hasattr(distribution, "failure_loss"):
-        failure_loss = jnp.mean(distribution.failure_loss(minibatch.sample, minibatch.is_failure))
-        total += hyperparameters.failure_coefficient * failure_loss
-        foretold = {"loss/failure": failure_loss}
+    failure_loss = getattr(method, "failure_loss", None)
+    if failure_loss is not None:
+        taken = method.decode(minibatch.sample, available, actions.table).id
+        failed = jnp.mean(
+            failure_loss(params, distribution, actions.table[taken], minibatch.is_failure)
+        )
+        total += hyperparameters.failure_coefficient * failed
+        foretold = {"loss/failure": failed}
     return total, {
         **foretold,
         "loss/total": total,

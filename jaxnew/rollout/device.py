@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 
 from jaxnew.environment import Environment, Info
-from jaxnew.policy import PolicyMethod, distribution_and_value
+from jaxnew.policy import PolicyMethod, distribution_and_value, method_of_evaluations
 from jaxnew.rollout.contract import Episode, Policy, RolloutBatch, RolloutConfig
 from jaxnew.rollout.normalization import RunningStatistics
 from jaxnew.sampling import Actions, AvailableSet
@@ -330,7 +330,8 @@ class DeviceRollout:
         obs, first_state = jax.vmap(self.env.reset_env, in_axes=(0, None))(
             keys_reset, self.env_params
         )
-        projected = self.method.project(policy.params, actions.offered(available))
+        method = method_of_evaluations(self.method)
+        projected = method.project(policy.params, actions.offered(available))
         rows = actions.rows(projected, available)
 
         def step(carry: tuple[Any, ...], t: jax.Array) -> tuple[tuple[Any, ...], Any]:
@@ -338,13 +339,13 @@ class DeviceRollout:
             if policy.observation_statistics is not None:
                 obs = self._normalize(obs, policy.observation_statistics)
             now = actions.at(available, t)
-            distribution = self.method.distribution(policy.params, obs, rows, now.mask)
+            distribution = method.distribution(policy.params, obs, rows, now.mask)
             keys_now = jax.vmap(lambda k: jax.random.split(jax.random.fold_in(k, t)))(keys_steps)
             if is_greedy:
                 sample = distribution.mode()
             else:
                 sample = jax.vmap(lambda d, k: d.sample(k))(distribution, keys_now[:, 0])
-            action = self.method.decode(sample, now, actions.table)
+            action = method.decode(sample, now, actions.table)
             obs, state, reward, terminated, truncated, info = jax.vmap(
                 self.env.step_env, in_axes=(0, 0, 0, None)
             )(keys_now[:, 1], state, action, self.env_params)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 
-from jaxnew.policy import PolicyMethod
+from jaxnew.policy import PolicyMethod, method_of_evaluations
 from jaxnew.rollout.acting import (
     WIDTH,
     Acting,
@@ -217,7 +217,7 @@ class HostRollout:
 
     @cached_property
     def _player(self) -> EpisodePlayer:
-        return EpisodePlayer(self.environments, self.method, self.width)
+        return EpisodePlayer(self.environments, method_of_evaluations(self.method), self.width)
 
     @cached_property
     def draw_next(self) -> Any:

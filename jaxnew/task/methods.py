@@ -56,8 +56,13 @@ VARIANTS = {
     "modulated": Variant(
         "modulated",
         training_share=0.5,
-        minibatch_factor=4,
-        changes={"network__state_width": 256, "hyperparameters__representation_noise": 0.2},
+        minibatch_factor=8,
+        changes={
+            "ppo__num_epochs": 2,
+            "network__state_width": 256,
+            "hyperparameters__representation_noise": 0.2,
+            "hyperparameters__final_entropy": 0.1,
+        },
     ),
     "no-subsampling": Variant("ours", scores_fixed_set=True, changes=_ONE_SET),
     "no-entropy": Variant("ours", changes={"hyperparameters__entropy_coefficient": 0.0}),

@@ -126,20 +126,23 @@ def test_what_each_method_changes() -> None:
 @pytest.mark.unit
 @pytest.mark.parametrize("name", [*TASKS, "create-push", "shape_stacking"])
 def test_what_a_modulated_utility_is_trained_with(name: str) -> None:
-    """docs/method.md, "Modulated utility": as many steps, four times as many gradient steps."""
+    """docs/method.md, "Modulated utility": as many steps, half the passes, eight times as many
+    minibatches in each."""
     domain = Domain.of(load_task(name), None)
     for budget_name, budget in domain.task.stage_two.items():
         found = adapted(budget, "modulated", domain.task, domain.split)
         assert (found.network.state_width, found.network.utility_width) == (256, 64)
-        assert found.hyperparameters.representation_noise == 0.2
+        numbers = found.hyperparameters
+        assert (numbers.representation_noise, numbers.final_entropy) == (0.2, 0.1)
         assert (found.sets.size, budget.sets.training_size) == (budget.sets.size, 0)
         assert found.sets.training_size == (budget.sets.size + 1) // 2
         assert found.num_updates == budget.num_updates
         assert found.ppo.steps_per_update == budget.ppo.steps_per_update
         # Two environments of 11 steps cannot be divided by eight.
         is_odd = (name, budget_name) == ("shape_stacking", "smoke")
-        times = 1 if is_odd else 4
+        times = 1 if is_odd else 8
         assert found.ppo.num_minibatches == times * budget.ppo.num_minibatches
+        assert (found.ppo.num_epochs, budget.ppo.num_epochs) in ((2, 4), (2, 2))  # 2 of `smoke`.
         assert budget.network == NetworkConfig()
 
 

@@ -50,28 +50,46 @@ def utilities(params: dict[str, Any], obs: np.ndarray, representations: np.ndarr
 def modulated(
     params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """f64[..., m] utilities and log-odds of a failure, with h numbers in the hidden layer x:
+    """f64[..., m] utilities and f64[..., m, 4] log-odds of a failure:
 
     a_i = ReLU( Lin(d,w)(c_i) );  x_i = ReLU( Lin(2w,h)( [f(s), a_i] ) );
-    o_i = Lin(w,h)(f(s)) . x_i + Lin(w,1)(f(s));  u_i = Lin(w,h)(f(s)) . x_i - k ln(1 + e^o_i).
+    u_i = Lin(w,h)(f(s)) . x_i;
+
+    and for each of the heads, with k = 32 numbers in its own hidden layer,
+
+    x_i = ReLU( Lin(2w,k)( [f(s), a_i] ) );  o_i = Lin(w,k)(f(s)) . x_i + Lin(w,1)(f(s)).
     """
-    utility = params["utility"]
+    utility, failure = params["utility"], params["failure"]
     features = encode(params["encoder"], obs, relu)
     embedded = relu(dense(utility["embed"], np.asarray(representations, np.float64)))
     repeated = np.repeat(features[..., None, :], embedded.shape[-2], axis=-2)
     hidden = relu(dense(utility, np.concatenate([repeated, embedded], axis=-1)))
-    failure = dense(utility["failure"], features)
-    odds = np.einsum("...h,...mh->...m", failure[..., :-1], hidden) + failure[..., -1:]
     scores = np.einsum("...h,...mh->...m", dense(utility["score"], features), hidden)
-    caution = float(utility["caution"])
-    return scores - caution * np.logaddexp(0.0, odds), odds
+    odds = []
+    of_state = np.asarray(failure["of_state"]["kernel"], np.float64)
+    weights = dense(failure["weights"], features)
+    for head in range(4):
+        mine, last = slice(32 * head, 32 * head + 32), slice(33 * head, 33 * head + 33)
+        of_action = {name: x[..., mine] for name, x in failure["of_action"].items()}
+        hidden = relu((features @ of_state[:, mine])[..., None, :] + dense(of_action, embedded))
+        of_head = weights[..., last]
+        odds.append(np.einsum("...k,...mk->...m", of_head[..., :-1], hidden) + of_head[..., -1:])
+    return scores, np.stack(odds, axis=-1)
 
 
 def modulated_utilities(
     params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
 ) -> np.ndarray:
-    """The first of `modulated`."""
+    """f64[..., m] those that it learns with."""
     return modulated(params, obs, representations)[0]
+
+
+def cautious_utilities(
+    params: dict[str, Any], obs: np.ndarray, representations: np.ndarray
+) -> np.ndarray:
+    """f64[..., m] those of evaluations: u_i - 8 ln(1 + e^o_i), of the largest o_i of all heads."""
+    scores, odds = modulated(params, obs, representations)
+    return scores - 8.0 * np.logaddexp(0.0, odds.max(axis=-1))
 
 
 def log_softmax(utility: np.ndarray, mask: np.ndarray) -> np.ndarray:

@@ -22,6 +22,7 @@ from jaxnew.rollout.contract import RolloutConfig
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.sampling import Actions, AvailableSet
 from tests import probe_environments as probe
+from tests.jaxnew.policy import numpy_policy
 
 N, M, D, K, A, NUM_OBS = 3, 5, 4, 2, 12, 6
 SPEC = ActionSpec(A, position_dim=K, has_stop=True)
@@ -234,7 +235,8 @@ def test_the_gradient_reaches_every_parameter(name: str, is_conditioned: bool) -
         found = distribution_of(method, params)
         total = jnp.sum(found.log_prob(sample)) + jnp.sum(method.value(params, OBS))
         if name == "modulated":
-            total += jnp.sum(found.failure_loss(sample, jnp.ones(N, bool)))
+            failed = np.ones(N, bool)
+            total += jnp.sum(method.failure_loss(params, found, TABLE[:N], failed))
         return total
 
     gradients = jax.grad(total)(params)
@@ -245,6 +247,26 @@ def test_the_gradient_reaches_every_parameter(name: str, is_conditioned: bool) -
     ]
     # A softmax does not feel what is added to all utilities.
     assert silent == (["['utility']['score']['bias']"] if name == "ours" else [])
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("is_conditioned", [False, True])
+def test_in_evaluations_the_choice_is_cautious_and_the_rest_as_it_was(is_conditioned: bool) -> None:
+    method = method_of("modulated", is_conditioned)
+    params = moved(method.init(jax.random.key(0), OBS[0], D))
+    learning, evaluated = (distribution_of(m, params) for m in (method, method.for_evaluation()))
+    scores, odds = numpy_policy.modulated(params, OBS, np.asarray(TABLE)[SETS.ids])
+    for found, expected in (
+        (learning, scores),
+        (evaluated, scores - 8.0 * np.logaddexp(0.0, odds.max(axis=-1))),
+    ):
+        shifted = np.asarray(found.choice.logits) - np.asarray(found.choice.logits)[:, :1]
+        expected = expected - expected[:, :1]
+        np.testing.assert_allclose(shifted, expected, rtol=1e-3, atol=1e-3)
+    for part in ("stop", "position"):
+        jax.tree.map(
+            np.testing.assert_array_equal, getattr(learning, part), getattr(evaluated, part)
+        )
 
 
 @pytest.mark.unit

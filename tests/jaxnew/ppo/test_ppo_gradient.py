@@ -103,7 +103,8 @@ def test_learning_from_two_batches_is_what_the_formulas_say(
     """
     hp = Hyperparameters(
         learning_rate=2e-3,
-        entropy_coefficient=0.03,
+        entropy_coefficient=0.3,
+        final_entropy=0.25,
         clip=0.15,
         discount=0.9,
         gae_lambda=0.8,
@@ -121,6 +122,7 @@ def test_learning_from_two_batches_is_what_the_formulas_say(
         *state, metrics = learn(key, *state, as_batch(data), hp, ACTIONS, jnp.int32(update))
 
         learning_rate = 2e-3 * (1 - 0.9 * min(1.0, update / 10))
+        now = hp.replace(entropy_coefficient=0.3 * (1 - 0.75 * min(1.0, update / 10)))
         np.testing.assert_allclose(metrics["learning_rate"], learning_rate, rtol=1e-6)
         has_no_future = data["done"] if config is CONFIG else data["terminated"]
         advantages = naive.advantages_of(data, has_no_future, hp)
@@ -136,7 +138,7 @@ def test_learning_from_two_batches_is_what_the_formulas_say(
         history: list[dict[str, float]] = []
         for indices in np.asarray(learner._minibatch_indices(key)):
             minibatch = {name: x[indices] for name, x in flat.items()}
-            parts, grads = naive.gradient(expected, TABLE, minibatch, hp)
+            parts, grads = naive.gradient(expected, TABLE, minibatch, now)
             expected, norm = adam.step(expected, grads, learning_rate)
             norms.append(norm)
             history.append({**parts, "gradient_norm": norm})
@@ -208,8 +210,8 @@ def test_failures_of_a_rollout_are_foretold_from_it(config: PPOConfig) -> None:
     is_failure = ends & (data["reward"] < data["value"])
     assert 0 < is_failure.sum() < ends.sum()
     _, odds = numpy_policy.modulated(params, data["observation"], TABLE[data["ids"]])
-    odds = np.take_along_axis(odds, data["sample"][..., None], axis=-1)[..., 0]
-    expected = np.mean(np.logaddexp(0.0, np.where(is_failure, -odds, odds)))
+    odds = np.take_along_axis(odds, data["sample"][..., None, None], axis=-2)[..., 0, :]
+    expected = 4 * np.mean(np.logaddexp(0.0, np.where(is_failure[..., None], -odds, odds)))
     np.testing.assert_allclose(metrics["loss/failure"], expected, rtol=1e-4)
 
 
@@ -250,7 +252,7 @@ def test_learning_rate_schedule(
     if num_steps == 384:
         assert config.lr_updates == 8138
     learner = learner_of(config)
-    got = 1e-3 * float(learner._learning_rate_factor(jnp.int32(update)))
+    got = 1e-3 * float(learner._falling_to(0.1, jnp.int32(update)))
     # To the digits given.
     np.testing.assert_allclose(got, expected, rtol=1.5e-2 if expected in (4.6e-4,) else 6e-3)
     if update == 4849:

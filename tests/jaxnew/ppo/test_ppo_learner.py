@@ -186,6 +186,7 @@ def test_defaults_are_those_of_the_paper_in_grid_world() -> None:
     assert vars(HP) == {
         "learning_rate": 1e-3,
         "entropy_coefficient": 0.05,
+        "final_entropy": 1.0,
         "clip": 0.1,
         "discount": 0.99,
         "gae_lambda": 0.95,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from jaxnew.policy import UtilityMethod
-from jaxnew.policy.utility import ModulatedMethod
+from jaxnew.policy.modulated import ModulatedMethod
 from jaxnew.ppo import Hyperparameters
 from jaxnew.ppo.objective import Minibatch, loss, normalize_advantages
 from jaxnew.sampling import Actions, AvailableSet
@@ -120,13 +120,15 @@ def test_foretold_failures_are_learned_from_the_actions_that_were_taken(params: 
     _, odds = numpy_policy.modulated(foretelling, data["observation"], TABLE[data["ids"]])
     odds = odds[np.arange(B), data["sample"]]
     assert odds.std() > 0.2
-    expected = np.mean(np.logaddexp(0.0, np.where(data["is_failure"], -odds, odds)))
+    failed = data["is_failure"][:, None]
+    expected = 4 * np.mean(np.logaddexp(0.0, np.where(failed, -odds, odds)))
     np.testing.assert_allclose(parts["loss/failure"], expected, **TOLERANCE)
     rest = parts["loss/policy"] + hp.value_coefficient * parts["loss/value"]
     rest -= hp.entropy_coefficient * parts["policy/entropy"]
     np.testing.assert_allclose(total, rest + 0.7 * expected, **TOLERANCE)
-    slope = 0.7 * np.mean(1.0 / (1.0 + np.exp(-odds)) - data["is_failure"])  # Of the odds' bias.
-    np.testing.assert_allclose(grads["utility"]["failure"]["bias"][-1], slope, **TOLERANCE)
+    slope = 0.7 * 4 * np.mean(1.0 / (1.0 + np.exp(-odds)) - failed)  # Of the odds' biases.
+    biases = np.asarray(grads["failure"]["weights"]["bias"]).reshape(4, -1)[:, -1]
+    np.testing.assert_allclose(np.sum(biases), slope, **TOLERANCE)
 
 
 def one_transition(

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxnew.policy import make_method
+from jaxnew.policy import Categorical, PolicyMethod, UtilityMethod, make_method
 from jaxnew.rollout.contract import Episode, Policy, Rollout, RolloutBatch, RolloutConfig
 from jaxnew.rollout.device import DeviceRollout
 from jaxnew.rollout.host import HostRollout
@@ -64,13 +64,29 @@ class LadderPool(toy_host.ToyPool):
     position_dim, episode_metrics, max_steps = 0, METRICS, LIMIT
 
 
+class OfEvaluations(UtilityMethod):
+    """Takes what it is offered first."""
+
+    def distribution_of(self, params: Any, features: Any, projected: Any, mask: Any) -> Any:
+        del params, features, projected
+        is_first = np.arange(mask.shape[-1]) == 0
+        return Categorical.masked(jnp.zeros(mask.shape), mask & is_first)
+
+
+class Learning(UtilityMethod):
+    """As ours, but for evaluations."""
+
+    def for_evaluation(self) -> OfEvaluations:
+        return OfEvaluations(self.network)
+
+
 @functools.cache
-def rollout_in(place: str) -> Rollout:
+def rollout_in(place: str, method: PolicyMethod = METHOD) -> Rollout:
     """A rollout that is known by its contract alone."""
     if place == "device":
-        return DeviceRollout(probe.TableWorld(A), LADDER, METHOD, CONFIG, width=4)
+        return DeviceRollout(probe.TableWorld(A), LADDER, method, CONFIG, width=4)
     pool = HostEnvironments(functools.partial(LadderPool, N, 2), LIMIT)
-    return HostRollout(pool, METHOD, CONFIG, jax.ShapeDtypeStruct((4,), jnp.float32), width=4)
+    return HostRollout(pool, method, CONFIG, jax.ShapeDtypeStruct((4,), jnp.float32), width=4)
 
 
 @functools.cache
@@ -125,6 +141,19 @@ def test_a_rollout_has_the_documented_shapes(place: str) -> None:
     kinds = [jax.tree.map(lambda x: (np.shape(x), x.dtype), s) for s in (before, after)]
     assert kinds[0] == kinds[1]
     assert hasattr(after, "observation_statistics")
+
+
+@pytest.mark.contract
+@pytest.mark.parametrize("place", PLACES)
+def test_who_acts_in_evaluations_is_up_to_the_method(place: str) -> None:
+    rollout = rollout_in(place, Learning())
+    state = rollout.init(jax.random.key(1), ACTIONS)
+    _, batch, _ = rollout.collect(jax.random.key(2), state, policy().params, ACTIONS, 0.9)
+    assert len(np.unique(np.asarray(batch.sample))) > 1
+    episodes = rollout.episodes(policy(), ACTIONS, KEY, 0, 5)
+    assert all(e.action_ids == [e.available_ids[0]] * len(e.actions) for e in episodes)
+    lengths = rollout.measure(policy(), ACTIONS, KEY, 5)["num_steps"]
+    assert lengths.tolist() == [len(e.actions) for e in episodes]
 
 
 @pytest.mark.contract
