@@ -17,6 +17,7 @@ COMMANDS = (
     "embed",
     "train",
     "evaluate",
+    "compare",
     "sweep",
     "finetune",
     "figures",

@@ -4,6 +4,8 @@ from jaxnew.actions import ActionSplit as ActionSplit
 from jaxnew.actions import ActionUniverse as ActionUniverse
 from jaxnew.checks.environment import check_environment as check_environment
 from jaxnew.checks.policy import check_method as check_method
+from jaxnew.comparison import Comparison as Comparison
+from jaxnew.comparison import compare as compare
 from jaxnew.embedding import Encoder as Encoder
 from jaxnew.embedding import embed as embed
 from jaxnew.environment import Action as Action
