@@ -42,7 +42,11 @@ def main() -> int | None:
     if all(given):
         unused = [name for name in _OF_TRAINING if name != "overwrite"]
         ARGUMENTS.refuse(unused, "with --checkpoint")
-        encode_new_actions(*map(Path, given))
+        checkpoint, recordings, output = map(Path, given)
+        check_new(output, ARGUMENTS.overwrite)
+        table = Encoder.load(checkpoint).encode(Recordings.load(recordings))
+        table.save(output)
+        print(f"{output}: {table.vectors.shape[0]} actions, {table.vectors.shape[1]} numbers each.")
     elif any(given):
         raise UsageError(
             "Encoding new actions takes all of --checkpoint, --observations and --output."
@@ -61,14 +65,6 @@ def main() -> int | None:
             print_report(encoder)
         return encoder.interrupted_by
     return None
-
-
-def encode_new_actions(checkpoint: Path, recordings: Path, output: Path) -> None:
-    """Representations of recorded actions from a frozen encoder."""
-    check_new(output, ARGUMENTS.overwrite)
-    table = Encoder.load(checkpoint).encode(Recordings.load(recordings))
-    table.save(output)
-    print(f"{output}: {table.vectors.shape[0]} actions, {table.vectors.shape[1]} numbers each.")
 
 
 def print_report(encoder: Encoder) -> None:

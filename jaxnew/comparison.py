@@ -72,8 +72,8 @@ def compare(
     first, second = _by_place(runs), _by_place(others)
     if not first or first.keys() != second.keys():
         raise UsageError(
-            "Every run needs another one of its task, split and seed to compare it with: got "
-            f"{_listed(first)} against {_listed(second)}."
+            "Give runs, and for each of them another one of its task, split and seed to compare it "
+            f"with; got {_listed(first)} against {_listed(second)}."
         )
     sizes = {run.config.sets.size for run in (*runs, *others)}
     if len({run.config.task for run in runs}) > 1 or len(sizes) > 1:
@@ -88,9 +88,9 @@ def compare(
         ]
         for place in sorted(first)
     }
-    differences: dict[tuple[str, int], list[np.ndarray]] = {}
-    for (*split, _), (mine, theirs) in played.items():
-        differences.setdefault(tuple(split), []).append(mine - theirs)
+    differences: dict[tuple[str, str, int], list[np.ndarray]] = {}
+    for place, (mine, theirs) in played.items():
+        differences.setdefault(place[:3], []).append(mine - theirs)
     return Comparison(
         metric,
         part,

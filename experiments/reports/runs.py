@@ -232,7 +232,12 @@ def read_runs(paths: Sequence[Path]) -> list[RunRecord]:
     runs: dict[Path, RunRecord] = {}
     for path in paths:
         for run_path in _members(path) or [path]:
-            runs.setdefault(run_path.resolve(), _read_run(run_path))
+            config = RunDirectory.load(run_path).config
+            if "representation" not in config or not ("ppo" in config or "model" in config):
+                raise UsageError(
+                    f"{run_path} is no run of train, sweep or embed, so there is nothing to draw."
+                )
+            runs.setdefault(run_path.resolve(), RunRecord(run_path, upgraded(config)))
     if not runs:
         raise UsageError("Say which runs: --run=DIRECTORY[,DIRECTORY...].")
     return list(runs.values())
@@ -255,13 +260,6 @@ def _has_diverged(member: Path) -> bool:
     if cause is not None:
         print(f"{member} is left out: {CAUSES[cause][0].lower()}, so that it diverged.")
     return cause is not None
-
-
-def _read_run(path: Path) -> RunRecord:
-    config = RunDirectory.load(path).config
-    if "representation" not in config or not ("ppo" in config or "model" in config):
-        raise UsageError(f"{path} is no run of train, sweep or embed, so there is nothing to draw.")
-    return RunRecord(path, upgraded(config))
 
 
 def policies(paths: Sequence[Path]) -> list[RunRecord]:

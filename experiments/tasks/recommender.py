@@ -26,11 +26,6 @@ _PAPER = StageTwoBudget(
 )
 
 
-def _fixed_set(ids: np.ndarray) -> np.ndarray:
-    """2,000 of the products, drawn once."""
-    return np.random.RandomState(42).choice(ids, 2000, replace=False)
-
-
 TASK = Task(
     name="recommender",
     make_environment=Recommender,
@@ -65,7 +60,10 @@ TASK = Task(
         ),
     },
     selection_metric="click_through_rate",
-    baselines=Baselines(fixed_set=_fixed_set),
+    # 2,000 of the products, drawn once.
+    baselines=Baselines(
+        fixed_set=lambda ids: np.random.RandomState(42).choice(ids, 2000, replace=False)
+    ),
     shown=Presentation(
         paper_environment="Recommender",
         measured=Measured(

@@ -115,10 +115,8 @@ class Moves:
 
     def sample(self, key: jax.Array) -> Action:
         """What it does, its `id` an index into the available set, or -1; consumes `key`."""
-        return self._scripted() if self.name == SCRIPTED else self._random(key)
-
-    def _random(self, key: jax.Array) -> Action:
-        """A uniform choice and position, and perhaps a stop."""
+        if self.name == SCRIPTED:
+            return self._scripted()
         key_choice, key_position, key_stop = jax.random.split(key, 3)
         return Action(
             Categorical.masked(jnp.zeros_like(self.sizes), self.mask).sample(key_choice),
