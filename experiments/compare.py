@@ -13,7 +13,7 @@ from experiments.flags import Arguments
 from jaxnew.comparison import compare
 from jaxnew.run import Run
 
-ARGUMENTS = Arguments(__doc__, "trust")
+ARGUMENTS = Arguments(__doc__, "workers", "trust", "debug_nans")
 ARGUMENTS.define("list", "run", [], "Run directories of train.")
 ARGUMENTS.define("list", "against", [], "As many, of the same splits and seeds.")
 ARGUMENTS.define("list", "sets", ["test"], "Parts of the split: train, validation, test.")
@@ -23,7 +23,7 @@ ARGUMENTS.define("integer", "episodes", 5000, "Episodes of every run.", lower_bo
 def main() -> None:
     with ExitStack() as stack:
         runs, others = (
-            [stack.enter_context(Run.load(path)) for path in given]
+            [stack.enter_context(Run.load(path, num_workers=ARGUMENTS.workers)) for path in given]
             for given in (ARGUMENTS.run, ARGUMENTS.against)
         )
         for part in ARGUMENTS.sets:

@@ -39,9 +39,11 @@ LAYERS = (
         "runs",
         "training",
         "sweeping",
+        "comparison",
     },
 )
 SIDEWAYS = {
+    "comparison": {"run"},
     "actions": {"storage.files"},
     "observations": {"actions", "storage"},
     "collection": {"actions", "observations", "storage"},

@@ -89,7 +89,7 @@ def test_runs_play_the_same_episodes(tmp_path: Path) -> None:
         for seed in (1, 2)
     }
     ours, others = ([Run.load(made[name, s]) for s in (1, 2)] for name in ("ours", "random"))
-    found = jaxnew.compare(ours, others, "validation", episodes=40)
+    found: jaxnew.Comparison = jaxnew.compare(ours, others, "validation", episodes=40)
     expected = [
         [run.evaluate("validation", episodes=40).to_dict()["validation"]["metrics"] for run in runs]
         for runs in (ours, others)
