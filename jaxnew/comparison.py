@@ -23,13 +23,15 @@ class Comparison:
       part: what sets are drawn from, a part of the split.
       num_episodes: of every run.
       pairs: by seed of the split and seed of the runs, the mean of the one and that of the other.
-      difference: mean over splits of the mean over seeds, with its interval of `paired_interval`.
+      means: of both, over splits of the mean over seeds.
+      difference: of these, with its interval of `paired_interval`.
     """
 
     metric: str
     part: str
     num_episodes: int
     pairs: Mapping[tuple[int, int], tuple[float, float]]
+    means: tuple[float, float]
     difference: Interval
 
     def __str__(self) -> str:
@@ -41,10 +43,8 @@ class Comparison:
             f"{split:>10} {seed:>6} {mean:>9.4f} {other:>9.4f} {mean - other:>+11.4f}"
             for (split, seed), (mean, other) in self.pairs.items()
         ]
-        means = np.mean([*self.pairs.values()], axis=0)
-        lines.append(
-            f"{'mean':>17} {means[0]:>9.4f} {means[1]:>9.4f} {np.subtract(*means):>+11.4f}"
-        )
+        mean, other = self.means
+        lines.append(f"{'mean':>17} {mean:>9.4f} {other:>9.4f} {mean - other:>+11.4f}")
         shown = "{:+.4f} [{:+.4f}, {:+.4f}]".format(*self.difference)
         return "\n".join([*lines, f"{shown}, bootstrap over splits, seeds and episodes, 95 %"])
 
@@ -60,14 +60,14 @@ def compare(
     """Plays the same episodes with each run and with the other one of its split and seed.
 
     Args:
-      runs: of one task; no two of one split and seed.
+      runs: of one task and kind of split, each of its own split seed and seed.
       others: as many, of the same splits and seeds.
       part: of the split, `train`, `validation` or `test`.
       episodes: of each run.
       seed: of the episodes.
 
     Raises:
-      UsageError: the runs make no such pairs.
+      UsageError: the runs make no such pairs, or would play other episodes than their partners.
     """
     first, second = _by_place(runs), _by_place(others)
     if not first or first.keys() != second.keys():
@@ -75,31 +75,42 @@ def compare(
             "Give runs, and for each of them another one of its task, split and seed to compare it "
             f"with; got {_listed(first)} against {_listed(second)}."
         )
-    sizes = {run.config.sets.size for run in (*runs, *others)}
-    if len({run.config.task for run in runs}) > 1 or len(sizes) > 1:
-        raise UsageError("Compare runs of one task, with sets of one size.")
+    if len({place[:2] for place in first}) > 1:
+        raise UsageError(f"Compare runs of one task and one kind of split; got {_listed(first)}.")
+    for place in first:
+        mine, theirs = (found[place].config.environment for found in (first, second))
+        if mine != theirs:
+            raise UsageError(
+                f"{first[place].path} and {second[place].path} have other environments: {mine} and "
+                f"{theirs}."
+            )
+    actions = {run.path: run.trainer.actions(part) for run in (*runs, *others)}
+    sizes = {of.set_size for of in actions.values()}
+    if len(sizes) > 1:
+        raise UsageError(
+            f"With {part} actions these runs play sets of {sorted(sizes)} actions; compare runs "
+            "whose sets are of one size."
+        )
     metric = runs[0].task.selection_metric
-    played = {
-        place: [
-            measure(run.trainer.rollout, run.policy, run.trainer.actions(part), episodes, seed)[
-                metric
-            ].astype(np.float64)
-            for run in (first[place], second[place])
-        ]
-        for place in sorted(first)
-    }
-    differences: dict[tuple[str, str, int], list[np.ndarray]] = {}
-    for place, (mine, theirs) in played.items():
-        differences.setdefault(place[:3], []).append(mine - theirs)
+
+    def values_of(run: Run) -> np.ndarray:
+        played = measure(run.trainer.rollout, run.policy, actions[run.path], episodes, seed)
+        return played[metric].astype(np.float64)
+
+    pairs, by_split = {}, dict[int, list[tuple[np.ndarray, np.ndarray]]]()
+    for place in sorted(first):
+        both = values_of(first[place]), values_of(second[place])
+        pairs[place[2:]] = float(both[0].mean()), float(both[1].mean())
+        by_split.setdefault(place[2], []).append(both)
+    means = np.mean([np.mean(of_split, axis=(0, 2)) for of_split in by_split.values()], axis=0)
+    differences = [[mine - theirs for mine, theirs in of_split] for of_split in by_split.values()]
     return Comparison(
         metric,
         part,
         episodes,
-        {
-            (split_seed, of_run): (float(mine.mean()), float(theirs.mean()))
-            for (_, _, split_seed, of_run), (mine, theirs) in played.items()
-        },
-        paired_interval([*differences.values()]),
+        pairs,
+        (float(means[0]), float(means[1])),
+        paired_interval(differences),
     )
 
 

@@ -229,7 +229,8 @@ class AuxiliaryMethod(FeatureMethod):
     def for_evaluation(self) -> AuxiliaryMethod:
         """It with the method's own policy for evaluations."""
         changed = copy.copy(self)
-        changed._base = self._base.for_evaluation()
+        for_evaluation = getattr(self._base, "for_evaluation", lambda: self._base)
+        changed._base = for_evaluation()
         return changed
 
     def _failure_loss(

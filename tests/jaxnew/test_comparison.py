@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -54,11 +54,11 @@ class Recorded:
     path: Path = Path("run")
 
 
-def recorded(split_seed: int, seed: int, size: int = 50, task: str = "grid_world") -> Any:
-    sets = jaxnew.load_task("grid_world").stage_two["smoke"].sets
+def recorded(
+    split_seed: int, seed: int, task: str = "grid_world", environment: str = "usual"
+) -> Any:
     fields = {"task": task, "split": "default", "split_seed": split_seed, "seed": seed}
-    config = type("Config", (), {**fields, "sets": replace(sets, size=size)})
-    return Recorded(config)
+    return Recorded(type("Config", (), {**fields, "environment": environment}))
 
 
 @pytest.mark.unit
@@ -69,8 +69,13 @@ def test_runs_without_a_partner_are_refused() -> None:
         compare([], [])
     with pytest.raises(UsageError, match="are of one split and seed"):
         compare([recorded(0, 1), recorded(0, 1)], [recorded(0, 1)])
-    with pytest.raises(UsageError, match="sets of one size"):
-        compare([recorded(0, 1)], [recorded(0, 1, size=20)])
+    with pytest.raises(UsageError, match="have other environments: usual and slippery"):
+        compare([recorded(0, 1)], [recorded(0, 1, environment="slippery")])
+    two = [recorded(0, 1), recorded(0, 1, task="recommender")]
+    with pytest.raises(
+        UsageError, match=r"one task and one kind of split; got grid_world, .*; rec"
+    ):
+        compare(two, two)
 
 
 @pytest.mark.integration
@@ -99,5 +104,18 @@ def test_runs_play_the_same_episodes(tmp_path: Path) -> None:
     assert [*found.pairs.values()] == [*zip(*means, strict=True)]
     assert found.difference.mean == pytest.approx(np.subtract(*np.mean(means, axis=1)))
     assert "is_success, validation actions, 40 episodes" in str(found)
+    assert found.means == pytest.approx(np.mean(means, axis=1))
+    # All train actions at once are other episodes than sets of them.
+    fixed = jaxnew.train(
+        "grid_world",
+        "gt12",
+        method="no-subsampling",
+        budget="smoke",
+        seed=1,
+        set={"num_updates": 1},
+        runs=tmp_path,
+    )
+    with pytest.raises(UsageError, match=r"With train actions these runs play sets of .*one size"):
+        jaxnew.compare(ours[:1], [fixed], "train", episodes=4)
     same = jaxnew.compare(ours, [Run.load(made["ours", s]) for s in (1, 2)], episodes=40)
     assert same.difference == (0.0, 0.0, 0.0)
