@@ -17,6 +17,7 @@ from experiments.flags import Arguments
 from jaxnew.embedding import Encoder, embed
 from jaxnew.observations import Recordings
 from jaxnew.recording import REPRESENTATION_SEED
+from jaxnew.representation.report import measures
 from jaxnew.storage.files import check_new
 from jaxnew.task.places import UsageError
 
@@ -81,13 +82,11 @@ def print_report(encoder: Encoder) -> None:
 
 
 def _cells(numbers: Mapping[str, Any]) -> dict[str, str]:
-    """The numbers of one table by what they are, first what ordered policies best in pilots."""
-    found = {f"5-NN R2 to {fact}": r2 for fact, r2 in numbers["neighbour_r2"].items()}
-    found |= {"5-NN purity": numbers["purity_all"], "of held-out": numbers["purity_held_out"]}
-    found |= {f"linear R2 to {fact}": r2 for fact, r2 in numbers["linear_r2_mean"].items()}
+    """The numbers of one table by what they are."""
     entries = numbers["entries"]
     active = f"{entries['active_dimensions']}/{entries['dimensions']}"
-    plain = {label: "-" if value is None else f"{value:.3f}" for label, value in found.items()}
+    found = measures(numbers).items()
+    plain = {label: "-" if value is None else f"{value:.3f}" for label, value in found}
     return plain | {"dimensions that vary": active}
 
 

@@ -180,7 +180,7 @@ class Encoder:
         """
         split = ActionSplit.load(self.path / SPLIT_FILE)
         check_same("split", split.hash, self.config.split_hash, self.path)
-        numbers = _described(self.task, split, self.table.vectors)
+        numbers = table_report(self.task, split, self.table.vectors)
         RunDirectory.load(self.path).record_evaluation("representation", numbers)
         return numbers
 
@@ -197,11 +197,11 @@ class Encoder:
         if (self.path / UNTRAINED_FILE).exists():
             vectors["untrained"] = RepresentationTable.load(self.path / UNTRAINED_FILE).vectors
         vectors |= universe.engineered
-        return {name: _described(self.task, split, each) for name, each in vectors.items()}
+        return {name: table_report(self.task, split, each) for name, each in vectors.items()}
 
 
-def _described(task: Task, split: ActionSplit, vectors: np.ndarray) -> dict[str, Any]:
-    """`report.describe` of vectors f32[A, d] of the first A actions of a task."""
+def table_report(task: Task, split: ActionSplit, vectors: np.ndarray) -> dict[str, Any]:
+    """What vectors f32[A, d] tell of the first A actions of a task, see `report.describe`."""
     universe = task.make_universe().first(len(vectors))
     targets = task.shown.representation_targets
     return report.describe(

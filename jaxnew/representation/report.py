@@ -161,6 +161,16 @@ def describe(
     }
 
 
+def measures(numbers: Mapping[str, Any]) -> dict[str, float | None]:
+    """What `describe` gave, by name: first what tells most of a policy's success.
+
+    None where a number is not defined.
+    """
+    found = {f"5-NN R2 to {fact}": r2 for fact, r2 in numbers["neighbour_r2"].items()}
+    found |= {"5-NN purity": numbers["purity_all"], "of held-out": numbers["purity_held_out"]}
+    return found | {f"linear R2 to {fact}": r2 for fact, r2 in numbers["linear_r2_mean"].items()}
+
+
 def tsne(vectors: np.ndarray, seed: int) -> np.ndarray:
     """Two dimensions for a scatter plot: scikit-learn's t-SNE, perplexity 10.
 
