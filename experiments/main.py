@@ -23,7 +23,6 @@ COMMANDS = (
     "figures",
     "analyze",
     "anchors",
-    "contact_sheets",
     "demo",
 )
 

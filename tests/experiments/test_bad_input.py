@@ -207,7 +207,6 @@ PATHS: list[tuple[str, tuple[str, ...], str]] = [
         "flag --values=1,b: could not",
     ),
     ("anchors", (f"--out={NOWHERE}", "--episodes=8"), f"Nothing can be written in {NOWHERE}"),
-    ("contact_sheets", (f"--out={NOWHERE}",), f"Nothing can be written in {NOWHERE}"),
     ("train", ("--budget=smoke", f"--representation={LONG}.npz"), "File name too long"),
 ]
 

@@ -11,7 +11,7 @@ import stage1_reference as reference
 
 from jaxnew.finiteness import cause_of
 from jaxnew.representation import batches, learner, report
-from jaxnew.representation.modality import Modality, one_hot_modality, vector_modality
+from jaxnew.representation.modality import one_hot_modality, vector_modality
 
 XY = vector_modality("xy", 2)
 TINY = learner.RepresentationConfig(
@@ -318,73 +318,6 @@ def test_flat_vae_counts_every_step_as_an_epoch(flat):
     _, metrics = stage1.train_steps(state, recordings, 1)
     expected = -(1.25 * metrics["reconstruction"] - metrics["kl_observation"] / 1.25)
     np.testing.assert_allclose(metrics["loss"], expected, rtol=1e-5)
-
-
-@pytest.mark.unit
-def test_one_hot_features_are_blocks_per_coordinate():
-    modality = one_hot_modality("onehot", 2, 5)
-    features = modality.featurize(jnp.array([[1, 4], [0, 2]], jnp.uint8))
-    assert features.dtype == jnp.float32
-    expected = np.concatenate([np.eye(5)[[1, 0]], np.eye(5)[[4, 2]]], axis=1)
-    np.testing.assert_array_equal(features, expected)
-    assert modality.feature_dim == 10
-    assert modality.gaussian_dim == 0
-    assert XY.gaussian_dim == 2
-
-
-@pytest.mark.unit
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"likelihood": "poisson"}, "unknown likelihood"),
-        ({"feature_dim": 0}, "feature_dim=0"),
-        ({"num_categories": 2}, "does not fit"),
-        ({"likelihood": "categorical"}, "does not fit"),
-        ({"likelihood": "categorical", "num_categories": 3}, "not a multiple"),
-    ],
-)
-def test_bad_modalities_are_refused(changes, message):
-    good = {
-        "name": "xy",
-        "feature_dim": 2,
-        "likelihood": "gaussian",
-        "num_categories": 0,
-        "featurize": lambda x: x,
-    }
-    with pytest.raises(ValueError, match=message):
-        Modality(**{**good, **changes})
-
-
-@pytest.mark.unit
-@pytest.mark.parametrize(
-    ("changes", "error", "message"),
-    [
-        ({"kind": "gan"}, ValueError, "kind='gan'"),
-        ({"hidden_width": 0}, ValueError, "hidden_width=0"),
-        ({"num_steps": 2.5}, TypeError, "num_steps=2.5"),
-        ({"learning_rate": float("nan")}, ValueError, "learning_rate=nan"),
-        ({"gradient_clip": -1.0}, ValueError, "gradient_clip=-1.0"),
-        ({"kl_recordings": 0}, ValueError, "kl_recordings=0 must be positive"),
-        ({"kl_recordings": 0.5}, TypeError, "kl_recordings=0.5 must be an integer"),
-    ],
-)
-def test_bad_configs_are_refused(changes, error, message):
-    with pytest.raises(error, match=message):
-        learner.RepresentationConfig(**changes)
-
-
-@pytest.mark.unit
-def test_encoders_in_minutes_keep_networks_and_the_weight_of_the_actions_divergence():
-    paper = learner.RepresentationConfig(hidden_width=7, recordings_per_action=464)
-    quick = paper.in_minutes(num_steps=9, recordings_per_action=4)
-    assert (quick.kl_recordings, quick.recordings_per_action, quick.num_steps) == (464, 4, 9)
-    batches = {"num_steps", "recordings_per_action", "kl_recordings"}
-    for field in dataclasses.fields(paper):
-        now, before = getattr(quick, field.name), getattr(paper, field.name)
-        is_changed = field.name in batches or (now is True and before is False)
-        assert is_changed or now == before, field.name
-    with pytest.raises(TypeError, match="num_stps"):
-        paper.in_minutes(num_stps=9)
 
 
 @pytest.mark.unit
