@@ -66,7 +66,8 @@ def test_each_lstm_bias_counts():
     variables = random_variables(module, x)
     before = apply(module, variables, x)[:, 0, 0]
     for name in ("bias_input", "bias_hidden"):
-        variables["params"]["BiLSTMLayer_1"]["backward"][name] += 0.5
+        layer = variables["params"]["BiLSTMLayer_1"]["backward"]
+        layer[name] = layer[name] + 0.5  # Not in place: the last call may still be reading it.
         after = apply(module, variables, x)[:, 0, 0]
         expected = reference.encode_recording(reference.as_float64(variables["params"]), x[0, 0])
         np.testing.assert_allclose(after, expected, rtol=RTOL)
