@@ -54,9 +54,10 @@ class Run:
         )
 
 
-ALIKE = {"line": Run(representation=EMBED.format("hvae"), flags=())}
-# The first two have the program of `line`, the others each their own.
+ALIKE = {"line": Run(flags=())}
+# The first three have the program of `line`, the others each their own.
 OTHERS = {
+    "encoded": Run(representation=EMBED.format("hvae")),
     "no-entropy": Run(method="no-entropy"),
     "full": Run(split="full"),
     "no-place": Run("-no-place", "nearest-neighbour", "random-21"),

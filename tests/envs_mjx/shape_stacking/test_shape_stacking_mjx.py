@@ -282,6 +282,7 @@ def test_worlds_that_get_too_fast_are_given_back(small: Mjx) -> None:
 
 
 @pytest.mark.contract
+@pytest.mark.slow
 def test_jit_vmap_and_scan_equal_direct_calls(small: Mjx) -> None:
     """And both follow C, in the fall and through the impact."""
     ids, qpos, qvel = falling(5)
