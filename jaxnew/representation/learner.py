@@ -259,14 +259,16 @@ class RepresentationLearner:
     def _run_steps(
         self, state: RepresentationState, recordings: jax.Array, num_steps: jax.Array
     ) -> tuple[RepresentationState, Metrics]:
+        update = jax.jit(self._update)  # Traced once for its shapes and for the loop.
+
         def body(
             _: jax.Array, carry: tuple[RepresentationState, Metrics]
         ) -> tuple[RepresentationState, Metrics]:
             state, totals = carry
-            state, metrics = self._update(state, recordings)
+            state, metrics = update(state, recordings)
             return state, _added(totals, metrics)
 
-        shapes = jax.eval_shape(self._update, state, recordings)[1]
+        shapes = jax.eval_shape(update, state, recordings)[1]
         zeros = jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), shapes)
         state, totals = jax.lax.fori_loop(0, num_steps, body, (state, zeros))
         return state, _means(totals, num_steps)
