@@ -76,11 +76,10 @@ def of_runs(paths: list[Path]) -> list[Path]:
     folder = output(paths[0].parent)
     episodes, workers = ARGUMENTS.episodes, ARGUMENTS.workers
     if ARGUMENTS.study == measures.NAME:
-        ARGUMENTS.refuse(("values",), f"for --study={measures.NAME}")
+        ARGUMENTS.refuse(("values",), "for --study=measures")
         return measures.study_measures(paths, episodes, folder, workers)
     encoder = Path(ARGUMENTS.encoder) if ARGUMENTS.encoder else None
-    values = ARGUMENTS.values
-    study = study_runs(ARGUMENTS.study, paths, values, episodes, encoder, workers)
+    study = study_runs(ARGUMENTS.study, paths, ARGUMENTS.values, episodes, encoder, workers)
     return write(study, paths[0].parent)
 
 

@@ -85,9 +85,8 @@ def _cells(numbers: Mapping[str, Any]) -> dict[str, str]:
     """The numbers of one table by what they are."""
     entries = numbers["entries"]
     active = f"{entries['active_dimensions']}/{entries['dimensions']}"
-    found = measures(numbers).items()
-    plain = {label: "-" if value is None else f"{value:.3f}" for label, value in found}
-    return plain | {"dimensions that vary": active}
+    shown = {k: "-" if v is None else f"{v:.3f}" for k, v in measures(numbers).items()}
+    return shown | {"dimensions that vary": active}
 
 
 if __name__ == "__main__":

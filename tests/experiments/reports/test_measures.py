@@ -41,14 +41,16 @@ def test_tables_are_ordered_by_what_their_policies_reach(
     assert places == sorted(places)
     assert "| noise-0.1 | 0 | 90.0 |" in text
     (ranks,) = [line for line in text.splitlines() if line.startswith("| Spearman, 4 tables | 0 |")]
-    assert ranks.split(" | ")[3] == "**+1.00**"  # 5-NN R2, the first measure.
+    assert ranks.split(" | ")[3] == "+1.00"  # 5-NN R2, the first measure.
     with written[2].open() as opened:
         rows = list(csv.DictReader(opened))
-    assert [float(row["test"]) for row in rows] == [0.2, 0.3, 0.6, 0.9]
+    assert [float(row["test"]) for row in rows] == [0.9, 0.6, 0.3, 0.2]
     told = [float(row["5-NN R2 to net displacement"]) for row in rows]
-    assert told == sorted(told)
-    with pytest.raises(UsageError, match="at least 3 of each split; the split of seed 0 has 2"):
-        study_measures(paths[:2], 1000, tmp_path / "few")
+    assert told == sorted(told, reverse=True)
+    config = {**plain_config(), "method": "modulated"}
+    other = write_run(tmp_path / "other", config)
+    with pytest.raises(UsageError, match=r"other has method=modulated and .*noise-0.1 ours; give"):
+        study_measures([*paths, other], 1000, tmp_path / "refused")
 
 
 @pytest.mark.oracle
