@@ -162,7 +162,7 @@ def describe(
 
 
 def measures(numbers: Mapping[str, Any]) -> dict[str, float | None]:
-    """What `describe` gave, by name: first what tells most of a policy's success.
+    """What `describe` gave, by name: first what ordered policies best in pilots.
 
     None where a number is not defined.
     """
