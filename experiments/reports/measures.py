@@ -132,7 +132,7 @@ def figure_of(found: Sequence[MeasuredTable], metric: Metric) -> Figure:
             x = [table.measures[name] for table in of_split]
             y = [metric.scale * table.success for table in of_split]
             label = f"split {seed}: rank correlation {rank_correlation(of_split, name):+.2f}"
-            axes.scatter(x, y, s=22, color=color, label=label)
+            axes.scatter(x, y, s=22, color=color, label=label.replace("+nan", "-"))
         axes.set_xlabel(name)
         axes.legend(**{**plots.LEGEND, "fontsize": 6.5})
         plots.tidy(axes)
